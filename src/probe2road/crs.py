@@ -1,0 +1,166 @@
+"""The local metric CRS of a run, and the gate that refuses degrees.
+
+Everything inside probe2road happens in one metric CRS, chosen once per run from the extent of the data, so
+that a metre is a metre to within a part per thousand wherever the fleet drives. Degrees exist only in files.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError as ProjCRSError
+
+from probe2road.errors import CRSError
+
+__all__ = ["WGS84", "local_crs", "parse_crs", "require_metric", "transform"]
+
+logger = logging.getLogger(__name__)
+
+WGS84 = CRS.from_epsg(4326)
+
+_UTM_ZONE_WIDTH = 6.0  # degrees of longitude
+_UTM_ZONE_OVERHANG = 0.5  # degrees a data set may reach into the next zone and still use this one
+_UTM_LATITUDES = (-80.0, 84.0)  # degrees; outside, UTM is not defined
+
+
+def parse_crs(value: Any, *, where: object = None) -> CRS:
+    """Return a CRS from anything pyproj understands (EPSG code, WKT, PROJ string, CRS).
+
+    Raises
+    ------
+    CRSError
+        If pyproj cannot read it.
+
+    Examples
+    --------
+    >>> parse_crs("EPSG:32616").to_epsg()
+    32616
+    """
+    try:
+        return CRS.from_user_input(value)
+    except ProjCRSError as error:
+        raise CRSError(
+            f"{value!r} is not a coordinate reference system", where=where, fix="use a form such as EPSG:32616"
+        ) from error
+
+
+def local_crs(lon: ArrayLike, lat: ArrayLike) -> CRS:
+    """Choose the metric CRS for data at these positions.
+
+    UTM where the data fits one zone (with half a degree of overhang); a transverse Mercator on the data's
+    own central meridian where it spans zones; a stereographic projection on the data's centre where UTM is
+    undefined, north of 84 degrees or south of 80. All three are conformal.
+
+    Parameters
+    ----------
+    lon, lat
+        Longitudes and latitudes in degrees, WGS84, any equal shape, at least one finite pair. Longitudes may
+        straddle the antimeridian.
+
+    Returns
+    -------
+    CRS
+        Projected, in metres, axes east and north.
+
+    Raises
+    ------
+    CRSError
+        If there is no finite position, or a latitude exceeds 90 degrees.
+
+    Examples
+    --------
+    >>> local_crs([-87.65], [41.87]).to_epsg()
+    32616
+    >>> local_crs([8.0, 16.5], [48.0, 48.0]).name
+    'probe2road local transverse Mercator at 12.25 E'
+    """
+    lon, lat = np.ravel(np.asarray(lon, float)), np.ravel(np.asarray(lat, float))
+    finite = np.isfinite(lon) & np.isfinite(lat)
+    lon, lat = lon[finite], lat[finite]
+    if lon.size == 0:
+        raise CRSError("no position to choose a local CRS from", fix="check that the data is not empty")
+    if np.abs(lat).max() > 90:
+        raise CRSError(f"latitude {lat[np.abs(lat).argmax()]:.6g} exceeds 90 degrees", fix="check the column order")
+
+    # Longitudes relative to one of them, in [-180, 180), so that 179 and -179 are two degrees apart.
+    relative = (lon - lon[0] + 180.0) % 360.0 - 180.0
+    west, east = lon[0] + relative.min(), lon[0] + relative.max()
+    south, north = lat.min(), lat.max()
+    middle = (west + east) / 2.0
+
+    if south < _UTM_LATITUDES[0] or north > _UTM_LATITUDES[1]:
+        return _named_crs(
+            f"+proj=stere +lat_0={(south + north) / 2:.6f} +lon_0={_wrap(middle):.6f} +k=1",
+            f"probe2road local stereographic at {(south + north) / 2:.2f} N {_wrap(middle):.2f} E",
+        )
+    zone_west = np.floor(middle / _UTM_ZONE_WIDTH) * _UTM_ZONE_WIDTH
+    if west >= zone_west - _UTM_ZONE_OVERHANG and east <= zone_west + _UTM_ZONE_WIDTH + _UTM_ZONE_OVERHANG:
+        zone = int(np.floor((_wrap(middle) + 180.0) / _UTM_ZONE_WIDTH)) % 60 + 1
+        return CRS.from_epsg((32600 if (south + north) / 2 >= 0 else 32700) + zone)
+    return _named_crs(
+        f"+proj=tmerc +lat_0={(south + north) / 2:.6f} +lon_0={_wrap(middle):.6f} +k=1",
+        f"probe2road local transverse Mercator at {_wrap(middle):.2f} E",
+    )
+
+
+def require_metric(crs: CRS | None, *, where: object = None) -> CRS:
+    """Return the CRS if lengths in it are metres; refuse anything else.
+
+    Raises
+    ------
+    CRSError
+        If there is no CRS, if it is geographic (degrees), or if its unit is not the metre.
+
+    Examples
+    --------
+    >>> require_metric(WGS84, where="graph")
+    Traceback (most recent call last):
+        ...
+    probe2road.errors.CRSError: graph: coordinates are in degrees (WGS 84); reproject to a metric CRS and rerun
+    """
+    if crs is None:
+        raise CRSError("no CRS", where=where, fix="say which one it is, for example --crs EPSG:32616")
+    if crs.is_geographic:
+        raise CRSError(
+            f"coordinates are in degrees ({crs.name})", where=where, fix="reproject to a metric CRS and rerun"
+        )
+    units = {axis.unit_name for axis in crs.axis_info[:2]}
+    if units - {"metre", "meter", "m"}:
+        raise CRSError(
+            f"coordinates are in {', '.join(sorted(units))} ({crs.name})",
+            where=where,
+            fix="reproject to a CRS in metres and rerun",
+        )
+    return crs
+
+
+def transform(x: ArrayLike, y: ArrayLike, source: CRS, target: CRS) -> tuple[Any, Any]:
+    """Transform coordinates, always in the order x (east, lon), y (north, lat).
+
+    Equal CRS return the input arrays unchanged. Points that cannot be projected come back as infinity.
+
+    Examples
+    --------
+    >>> x, y = transform([9.0], [0.0], WGS84, CRS.from_epsg(32632))
+    >>> float(round(x[0], 3)), float(round(y[0], 3))
+    (500000.0, 0.0)
+    """
+    if source == target:
+        return x, y
+    return Transformer.from_crs(source, target, always_xy=True).transform(x, y)
+
+
+def _wrap(lon: float) -> float:
+    """Bring a longitude into [-180, 180)."""
+    return float((lon + 180.0) % 360.0 - 180.0)
+
+
+def _named_crs(proj: str, name: str) -> CRS:
+    """Build a WGS84 projected CRS in metres that carries a name (PROJ strings are anonymous)."""
+    definition = CRS.from_user_input(f"{proj} +datum=WGS84 +units=m +no_defs +type=crs").to_json_dict()
+    definition["name"] = name
+    return CRS.from_json_dict(definition)

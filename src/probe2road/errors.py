@@ -1,0 +1,85 @@
+"""The errors that probe2road raises on purpose.
+
+Every message answers three questions: what is wrong, where it is, what to do about it. The command line
+prints that message and exits with code 2; a traceback therefore always means a defect in probe2road.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+__all__ = ["CRSError", "InputError", "MissingExtraError", "OptionError", "OutputError", "Probe2RoadError"]
+
+
+class Probe2RoadError(Exception):
+    """Base of every error that probe2road raises on purpose.
+
+    Parameters
+    ----------
+    what
+        The fault, in one clause.
+    where
+        File, table, column or row it was found in.
+    fix
+        What the user can do.
+
+    Examples
+    --------
+    >>> print(Probe2RoadError("column 'x' is missing", where="drives.csv", fix="pass --columns x=easting"))
+    drives.csv: column 'x' is missing; pass --columns x=easting
+    """
+
+    def __init__(self, what: str, *, where: object = None, fix: str | None = None) -> None:
+        self.what, self.where, self.fix = what, where, fix
+        prefix = "" if where is None else f"{where}: "
+        suffix = "" if fix is None else f"; {fix}"
+        super().__init__(f"{prefix}{what}{suffix}")
+
+
+class InputError(Probe2RoadError):
+    """The user's data is bad.
+
+    Examples
+    --------
+    All faults of one input are reported at once:
+
+    >>> print(InputError.from_faults(["no fixes", "no CRS"], where="drives.csv"))
+    drives.csv: 2 faults
+      1. no fixes
+      2. no CRS
+    """
+
+    @classmethod
+    def from_faults(cls, faults: Sequence[str], *, where: object = None) -> InputError:
+        """Build one error from the faults a validator collected (at least one)."""
+        if len(faults) == 1:
+            return cls(faults[0], where=where)
+        lines = "".join(f"\n  {number}. {fault}" for number, fault in enumerate(faults, start=1))
+        return cls(f"{len(faults)} faults{lines}", where=where)
+
+
+class CRSError(InputError):
+    """A coordinate reference system is missing, in degrees where metres are needed, or contradictory."""
+
+
+class OptionError(Probe2RoadError):
+    """An option is out of range, unknown, or contradicts another."""
+
+
+class OutputError(Probe2RoadError):
+    """An output cannot be written."""
+
+
+class MissingExtraError(Probe2RoadError):
+    """A feature needs an optional dependency that is not installed.
+
+    Examples
+    --------
+    >>> print(MissingExtraError.for_extra("train", feature="training the segmentation network"))
+    training the segmentation network needs an optional dependency; install it with: pip install 'probe2road[train]'
+    """
+
+    @classmethod
+    def for_extra(cls, extra: str, *, feature: str) -> MissingExtraError:
+        """Build the error that prints the exact install line of an extra."""
+        return cls(f"{feature} needs an optional dependency", fix=f"install it with: pip install 'probe2road[{extra}]'")
