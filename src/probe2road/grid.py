@@ -1,0 +1,194 @@
+"""Pixel grids in a metric CRS, their windows, and their files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pyproj import CRS
+
+from probe2road.crs import parse_crs, require_metric
+from probe2road.errors import InputError, OptionError
+from probe2road.io.atomic import atomic_path
+
+__all__ = ["Grid", "Window", "read_raster", "write_raster"]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A north-up pixel grid in a metric CRS.
+
+    Row 0 is the northernmost; pixel ``(row, col)`` covers ``left + col * resolution`` to
+    ``left + (col + 1) * resolution`` east and likewise southwards from ``top``.
+
+    Examples
+    --------
+    >>> grid = Grid.from_bounds((0.3, 0.2, 9.5, 4.9), resolution=1.0, crs="EPSG:32616")
+    >>> grid.shape, grid.bounds
+    ((5, 10), (0.0, 0.0, 10.0, 5.0))
+    >>> grid.rowcol([0.5, 9.9], [4.5, 0.1])
+    (array([0, 4]), array([0, 9]))
+    """
+
+    left: float
+    top: float
+    resolution: float  # m per pixel
+    rows: int
+    cols: int
+    crs: CRS
+
+    @classmethod
+    def from_bounds(
+        cls, bounds: tuple[float, float, float, float], *, resolution: float = 1.0, crs: Any, margin: float = 0.0
+    ) -> Grid:
+        """Return the smallest grid that covers bounds and a margin (m), on whole multiples of the resolution.
+
+        Because the origin is a multiple of the resolution, moving the data by whole pixels moves the grid
+        with it and changes no pixel.
+
+        Raises
+        ------
+        OptionError
+            If the resolution is not positive.
+        """
+        if not resolution > 0:
+            raise OptionError(f"resolution is {resolution}", where="Grid", fix="use metres per pixel, for example 1.0")
+        west, south, east, north = bounds
+        left, bottom = (int(np.floor((low - margin) / resolution)) for low in (west, south))
+        right, top = (int(np.floor((high + margin) / resolution)) + 1 for high in (east, north))
+        metric = require_metric(parse_crs(crs))
+        return cls(left * resolution, top * resolution, resolution, top - bottom, right - left, metric)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """``(rows, cols)``."""
+        return self.rows, self.cols
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """``(left, bottom, right, top)``, metres."""
+        return (
+            self.left,
+            self.top - self.rows * self.resolution,
+            self.left + self.cols * self.resolution,
+            self.top,
+        )
+
+    def rowcol(self, x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the pixel that contains each position; positions outside give indices outside the shape."""
+        col = np.floor((np.asarray(x, np.float64) - self.left) / self.resolution)
+        row = np.ceil((self.top - np.asarray(y, np.float64)) / self.resolution) - 1
+        return row.astype(np.int64), col.astype(np.int64)
+
+    def xy(self, row: ArrayLike, col: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the centres of pixels, which may be fractional."""
+        x = self.left + (np.asarray(col, np.float64) + 0.5) * self.resolution
+        y = self.top - (np.asarray(row, np.float64) + 0.5) * self.resolution
+        return x, y
+
+    def window(self, row: int, col: int, rows: int, cols: int) -> Grid:
+        """Return the grid of a rectangle of pixels, which may reach outside."""
+        return Grid(
+            self.left + col * self.resolution, self.top - row * self.resolution, self.resolution, rows, cols, self.crs
+        )
+
+    def windows(self, size: int, *, halo: int = 0) -> list[Window]:
+        """Cut the grid into square windows of ``size`` pixels (less at the far edges), row by row."""
+        return [
+            Window(row, col, min(size, self.rows - row), min(size, self.cols - col), halo)
+            for row in range(0, self.rows, size)
+            for col in range(0, self.cols, size)
+        ]
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of a grid's pixels that one pass answers for, and the context around it that it looks at."""
+
+    row: int
+    col: int
+    rows: int
+    cols: int
+    halo: int = 0  # pixels of context on every side, also beyond the grid
+
+    @property
+    def core(self) -> tuple[slice, slice]:
+        """Rows and columns of the window in an array of the whole grid."""
+        return slice(self.row, self.row + self.rows), slice(self.col, self.col + self.cols)
+
+    @property
+    def inner(self) -> tuple[slice, slice]:
+        """Rows and columns of the window in an array that has the halo around it."""
+        return slice(self.halo, self.halo + self.rows), slice(self.halo, self.halo + self.cols)
+
+    def grid(self, grid: Grid) -> Grid:
+        """Return the grid of the window and its halo."""
+        margin = 2 * self.halo
+        return grid.window(self.row - self.halo, self.col - self.halo, self.rows + margin, self.cols + margin)
+
+
+def write_raster(
+    path: str | Path, array: NDArray[Any], grid: Grid, *, names: Sequence[str] = (), nodata: float | None = None
+) -> None:
+    """Write a raster as a compressed, tiled GeoTIFF that QGIS opens in place; the file is complete or absent.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    array
+        Shape ``(channel, row, col)`` or ``(row, col)``.
+    grid
+        The array's grid.
+    names
+        One description per channel, or none.
+    nodata
+        Value to show as transparent.
+    """
+    import rasterio
+
+    bands = array[None] if array.ndim == 2 else array
+    profile = {
+        "driver": "GTiff",
+        "dtype": "uint8" if bands.dtype == np.bool_ else bands.dtype.name,
+        "count": bands.shape[0],
+        "height": grid.rows,
+        "width": grid.cols,
+        "crs": grid.crs.to_wkt(),
+        "transform": rasterio.transform.from_origin(grid.left, grid.top, grid.resolution, grid.resolution),
+        "compress": "zstd",
+        "tiled": True,
+        "nodata": nodata,
+        "bigtiff": "if_safer",
+    }
+    with atomic_path(path) as temporary, rasterio.open(temporary, "w", **profile) as target:
+        for number, band in enumerate(bands, start=1):
+            target.write(band.astype(profile["dtype"], copy=False), number)
+        for number, name in enumerate(names, start=1):
+            target.set_band_description(number, name)
+
+
+def read_raster(path: str | Path) -> tuple[NDArray[Any], Grid]:
+    """Read a north-up GeoTIFF with square pixels: its bands ``(channel, row, col)`` and their grid.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is rotated, or has pixels that are not square.
+    """
+    import rasterio
+
+    try:
+        with rasterio.open(path) as source:
+            transform, crs = source.transform, source.crs
+            array = source.read()
+    except rasterio.errors.RasterioError as error:
+        raise InputError(f"not a readable raster ({error})", where=path) from error
+    if transform.b or transform.d or not np.isclose(transform.a, -transform.e):
+        raise InputError("the raster is rotated or its pixels are not square", where=path, fix="warp it north-up")
+    metric = require_metric(CRS.from_user_input(crs) if crs else None, where=path)
+    return array, Grid(transform.c, transform.f, transform.a, array.shape[1], array.shape[2], metric)
