@@ -78,18 +78,7 @@ def local_crs(lon: ArrayLike, lat: ArrayLike) -> CRS:
     >>> local_crs([8.0, 16.5], [48.0, 48.0]).name
     'probe2road local transverse Mercator at 12.25 E'
     """
-    lon, lat = np.ravel(np.asarray(lon, float)), np.ravel(np.asarray(lat, float))
-    finite = np.isfinite(lon) & np.isfinite(lat)
-    lon, lat = lon[finite], lat[finite]
-    if lon.size == 0:
-        raise CRSError("no position to choose a local CRS from", fix="check that the data is not empty")
-    if np.abs(lat).max() > 90:
-        raise CRSError(f"latitude {lat[np.abs(lat).argmax()]:.6g} exceeds 90 degrees", fix="check the column order")
-
-    # Longitudes relative to one of them, in [-180, 180), so that 179 and -179 are two degrees apart.
-    relative = (lon - lon[0] + 180.0) % 360.0 - 180.0
-    west, east = lon[0] + relative.min(), lon[0] + relative.max()
-    south, north = lat.min(), lat.max()
+    west, south, east, north = _degree_extent(lon, lat)
     middle = (west + east) / 2.0
 
     if south < _UTM_LATITUDES[0] or north > _UTM_LATITUDES[1]:
@@ -152,6 +141,21 @@ def transform(x: ArrayLike, y: ArrayLike, source: CRS, target: CRS) -> tuple[Any
     if source == target:
         return x, y
     return Transformer.from_crs(source, target, always_xy=True).transform(x, y)
+
+
+def _degree_extent(lon: ArrayLike, lat: ArrayLike) -> tuple[float, float, float, float]:
+    """Return west, south, east, north of the finite positions; east may exceed 180 across the antimeridian."""
+    lons, lats = np.asarray(lon, np.float64).ravel(), np.asarray(lat, np.float64).ravel()
+    finite = np.isfinite(lons) & np.isfinite(lats)
+    lons, lats = lons[finite], lats[finite]
+    if lons.size == 0:
+        raise CRSError("no position to choose a local CRS from", fix="check that the data is not empty")
+    if np.abs(lats).max() > 90:
+        raise CRSError(f"latitude {lats[np.abs(lats).argmax()]:.6g} exceeds 90 degrees", fix="check the column order")
+    # Longitudes relative to one of them, in [-180, 180), so that 179 and -179 are two degrees apart.
+    relative = (lons - lons[0] + 180.0) % 360.0 - 180.0
+    west, east = lons[0] + relative.min(), lons[0] + relative.max()
+    return float(west), float(lats.min()), float(east), float(lats.max())
 
 
 def _wrap(lon: float) -> float:
