@@ -1,0 +1,3 @@
+"""The fleet simulator: road networks to 3-D lanes, traffic and sensors, to fleet data with known truth."""
+
+from __future__ import annotations
