@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pyproj import CRS, Transformer
+from pyproj import CRS, Proj, Transformer
 from pyproj.exceptions import CRSError as ProjCRSError
 
 from probe2road.errors import CRSError
 
-__all__ = ["WGS84", "local_crs", "parse_crs", "require_metric", "transform"]
+__all__ = ["WGS84", "is_true_to_scale", "local_crs", "parse_crs", "require_metric", "same_crs", "transform"]
 
 logger = logging.getLogger(__name__)
 
@@ -24,6 +24,7 @@ WGS84 = CRS.from_epsg(4326)
 
 _UTM_ZONE_WIDTH = 6.0  # degrees of longitude
 _UTM_ZONE_OVERHANG = 0.5  # degrees a data set may reach into the next zone and still use this one
+_SCALE_TOLERANCE = 2e-3  # of a projection that may stay the CRS of a run
 _UTM_LATITUDES = (-80.0, 84.0)  # degrees; outside, UTM is not defined
 
 
@@ -125,6 +126,37 @@ def require_metric(crs: CRS | None, *, where: object = None) -> CRS:
             fix="reproject to a CRS in metres and rerun",
         )
     return crs
+
+
+def is_true_to_scale(crs: CRS, lon: ArrayLike, lat: ArrayLike) -> bool:
+    """Say whether a metre of a projected CRS is a metre on the ground, to two parts per thousand, at positions.
+
+    Two per thousand is what a UTM zone shows half a zone beside its edge. Web Mercator fails away from the
+    equator, where its metre is short by the cosine of the latitude.
+
+    Examples
+    --------
+    >>> is_true_to_scale(CRS.from_epsg(32616), [-87.65], [41.87])
+    True
+    >>> is_true_to_scale(CRS.from_epsg(3857), [-87.65], [41.87])
+    False
+    """
+    factors = Proj(crs).get_factors(np.asarray(lon, np.float64), np.asarray(lat, np.float64))
+    scales = np.concatenate([np.ravel(factors.meridional_scale), np.ravel(factors.parallel_scale)])
+    return bool((np.abs(scales - 1.0) <= _SCALE_TOLERANCE).all())
+
+
+def same_crs(first: CRS, second: CRS) -> bool:
+    """Say whether coordinates in x, y order mean the same in both: axis order and heights do not count.
+
+    Examples
+    --------
+    >>> same_crs(parse_crs("OGC:CRS84"), WGS84), same_crs(parse_crs("EPSG:4979"), WGS84)
+    (True, True)
+    >>> same_crs(parse_crs("EPSG:4258"), WGS84)
+    False
+    """
+    return bool(first == second or first.to_2d().equals(second.to_2d(), ignore_axis_order=True))
 
 
 def transform(x: ArrayLike, y: ArrayLike, source: CRS, target: CRS) -> tuple[Any, Any]:

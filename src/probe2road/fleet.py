@@ -11,8 +11,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from probe2road.crs import WGS84, local_crs, parse_crs, require_metric, transform
-from probe2road.errors import InputError, OptionError
+from probe2road.crs import WGS84, is_true_to_scale, local_crs, parse_crs, require_metric, transform
+from probe2road.errors import CRSError, InputError, OptionError
 from probe2road.fleet_tables import (
     POINT_KINDS,
     check_points,
@@ -173,7 +173,8 @@ def fleet_from_tables(
     crs
         CRS of the coordinates of both tables; for a geographic one ``x`` is longitude, ``y`` latitude.
     target_crs
-        Metric CRS to work in; chosen from the data by `probe2road.crs.local_crs` where it is None.
+        Metric CRS to work in. Where it is None: ``crs`` itself if that is metric and true to scale over the
+        data (UTM is, Web Mercator is not), else the choice of `probe2road.crs.local_crs`.
     where
         What the tables were read from, for error messages.
 
@@ -246,15 +247,24 @@ def fleet_from_checked(
 
 
 def _metric_target(traces: pd.DataFrame, source: CRS, target_crs: Any, where: object) -> CRS:
-    """Return the CRS to work in: the given one, or the local one of the data's extent."""
+    """Return the CRS to work in: the given one, the data's own if it is metric and true to scale, or a local one."""
     if target_crs is not None:
         return require_metric(parse_crs(target_crs, where=where), where=where)
     x, y = traces["x"].to_numpy(), traces["y"].to_numpy()
     extremes = np.array([x.argmin(), x.argmax(), y.argmin(), y.argmax()])
     lon, lat = transform(x[extremes], y[extremes], source, WGS84)
-    crs = local_crs(lon, lat)
+    crs = source if _is_metric(source) and is_true_to_scale(source, lon, lat) else local_crs(lon, lat)
     logger.info("working in %s", crs.name)
     return crs
+
+
+def _is_metric(crs: CRS) -> bool:
+    """Say whether `require_metric` accepts a CRS."""
+    try:
+        require_metric(crs)
+    except CRSError:
+        return False
+    return True
 
 
 def _projected(table: pd.DataFrame, source: CRS, target: CRS) -> pd.DataFrame:

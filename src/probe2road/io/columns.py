@@ -1,0 +1,268 @@
+"""Which column of a file is which: the user's map, the usual names, the units of time, the kinds of points.
+
+Nothing here guesses silently. What is taken from a usual name is returned with the rest and logged by the
+reader; where two columns would do, the reader asks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from pyproj import CRS
+
+from probe2road.errors import InputError, OptionError
+from probe2road.fleet_tables import (
+    POINT_COLUMNS,
+    POINT_KINDS,
+    POINT_OPTIONAL_COLUMNS,
+    TRACE_COLUMNS,
+    TRACE_OPTIONAL_COLUMNS,
+)
+
+__all__ = ["KIND_SYNONYMS", "USUAL_NAMES", "ColumnChoice", "choose_columns", "standard_kinds", "times_from_numbers"]
+
+# Usual names per column of ours, in lower case with separators removed. Names before None are specific; those
+# behind it are so common for other things that they count only where no specific name is there.
+USUAL_NAMES: dict[str, tuple[str | None, ...]] = {
+    "trace_id": (
+        *("traceid", "trip", "tripid", "drive", "driveid", "track", "trackid", "journey", "journeyid", "trace"),
+        *("traj", "trajid", "trajectory", "trajectoryid", "rideid", "sessionid", "routeid", None, "id"),
+    ),
+    "t": (
+        *("t", "timestamp", "time", "ts", "datetime", "gpstime", "gpstimestamp", "timestamputc", "timeutc", "utc"),
+        *("epoch", "unixtime", "eventtime", "timems", "timestampms", "timestampns"),
+    ),
+    "z": ("z", "alt", "altitude", "ele", "elevation", None, "height"),
+    "vehicle_id": ("vehicleid", "vehicle", "vehid", "vin", "deviceid", None, "device"),
+    "heading": ("heading", "bearing", "course", "azimuth", "headingdeg"),
+    "speed": ("speed", "velocity", "speedms", "speedmps"),
+    "accuracy": ("accuracy", "horizontalaccuracy", "haccuracy", "hacc", "gpsaccuracy", "positionaccuracy"),
+    "kind": ("kind", "class", "classname", "featuretype", "objecttype", None, "label", "type", "category"),
+}
+_LON_LAT = (("lon", "lng", "long", "longitude", "gpslon", "gpslongitude"), ("lat", "latitude", "gpslat", "gpslatitude"))
+_PROJECTED = (("x", "easting", "east", "utmx", "utmeasting"), ("y", "northing", "north", "utmy", "utmnorthing"))
+_GEOMETRY = ("geometry", "geom", "wkbgeometry", "position")
+
+# What else the two kinds of semantic points are called, in lower case with separators removed.
+KIND_SYNONYMS: dict[str, tuple[str, ...]] = {
+    "lane_marking": (
+        *("lanemarking", "lanemarkings", "lanemarker", "lanemark", "marking", "markings", "laneline", "lane"),
+        *("roadmarking", "lanedivider", "divider", "1"),
+    ),
+    "road_boundary": (
+        *("roadboundary", "roadboundaries", "boundary", "boundaries", "roadedge", "edge", "kerb", "curb"),
+        *("roadborder", "border", "guardrail", "barrier", "2"),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class ColumnChoice:
+    """The columns to read from one file."""
+
+    columns: dict[str, str]  # our name -> the file's; "geometry" stands for x, y and z in one column
+    guessed: tuple[str, ...]  # our names that were found by usual name
+    degrees: bool  # the coordinates are longitude and latitude by name
+
+
+def choose_columns(
+    there: Sequence[str],
+    given: Mapping[str, Any] | None = None,
+    *,
+    points: bool = False,
+    geometry: str | None = None,
+    crs: CRS | None = None,
+    where: object = None,
+) -> ColumnChoice:
+    """Decide which columns of a file to read as ours.
+
+    Parameters
+    ----------
+    there
+        Column names of the file.
+    given
+        Our name to the file's, as the user said; an empty name means that the file has no such column.
+    points
+        Whether the file holds semantic points rather than traces.
+    geometry
+        Name of the file's point geometry column, which is preferred to guessed coordinates.
+    crs
+        CRS the user gave: where a file has both degrees and metres, it says which are meant.
+    where
+        The file, for messages.
+
+    Returns
+    -------
+    ColumnChoice
+        Columns that were neither given nor found are absent: traces may lack all but the position.
+
+    Raises
+    ------
+    InputError
+        If a given column is not there, if several columns have a usual name of the same one of ours, or if
+        none has one that is needed.
+    OptionError
+        If a given name is none of ours.
+
+    Examples
+    --------
+    >>> choose_columns(["Trip_ID", "time", "lat", "lon", "temperature"]).columns
+    {'trace_id': 'Trip_ID', 't': 'time', 'x': 'lon', 'y': 'lat'}
+    >>> choose_columns(["a", "b", "c"], {"trace_id": "a", "x": "b", "y": "c"}).guessed
+    ()
+    >>> choose_columns(["trip", "ts", "time", "x", "y"], where="drives.csv")
+    Traceback (most recent call last):
+        ...
+    probe2road.errors.InputError: drives.csv: column 't' could be ts, time; say which, for example --columns t=ts
+    """
+    ours = (*POINT_COLUMNS, *POINT_OPTIONAL_COLUMNS) if points else (*TRACE_COLUMNS, *TRACE_OPTIONAL_COLUMNS)
+    named = _given_columns(there, given or {}, (*ours, "geometry"), where)
+    left_out = {name for name, theirs in named.items() if not theirs}
+    chosen = {name: theirs for name, theirs in named.items() if theirs}
+    faults: list[str] = []
+    position, degrees = _position_columns(there, chosen, geometry, crs, faults)
+    in_geometry = {"x", "y", "z"} if "geometry" in position else set()
+    for name in ours:
+        if name in position:
+            chosen[name] = position[name]
+        elif name in USUAL_NAMES and name not in chosen and name not in left_out | in_geometry:
+            theirs = _usual(name, there, faults)
+            if theirs is not None and theirs not in chosen.values():
+                chosen[name] = theirs
+    chosen |= position
+    needed = {"x", "y", "trace_id", "kind"} if points else {"x", "y"}
+    missing = [name for name in ours if name in needed - in_geometry - set(chosen)]
+    if missing and not faults:
+        example = ",".join(f"{name}=NAME" for name in missing)
+        faults.append(
+            f"no column for {', '.join(missing)} (the columns are {', '.join(there)}); "
+            f"say which, for example --{'point-' if points else ''}columns {example}"
+        )
+    if faults:
+        raise InputError.from_faults(faults, where=where)
+    ordered = {name: chosen[name] for name in (*ours, "geometry") if name in chosen}
+    return ColumnChoice(ordered, tuple(name for name in ordered if name not in named), degrees)
+
+
+def standard_kinds(values: pd.Series) -> pd.Series:
+    """Replace what else the kinds of semantic points are called; other values stay as they are.
+
+    Examples
+    --------
+    >>> standard_kinds(pd.Series(["Lane Line", "kerb", "tree"])).tolist()
+    ['lane_marking', 'road_boundary', 'tree']
+    """
+    known = {synonym: kind for kind, synonyms in KIND_SYNONYMS.items() for synonym in synonyms}
+    codes, found = pd.factorize(values, use_na_sentinel=False)
+    standard = [kind if kind in POINT_KINDS else known.get(_plain(str(kind)), kind) for kind in found]
+    return pd.Series(np.array(standard, object)[codes], name=values.name)
+
+
+def times_from_numbers(values: pd.Series) -> tuple[pd.Series, str]:
+    """Convert times in seconds, milliseconds, microseconds or nanoseconds since 1970, by their magnitude.
+
+    Times before the year 5138 in one unit are smaller than those after 1973 in the next, so that the median
+    decides; smaller numbers, such as seconds since midnight, count as seconds.
+
+    Returns
+    -------
+    (Series, str)
+        UTC times (NaT where the number is missing) and the unit found. Values that are not finite or too
+        large for a time come back as they were, in seconds, for the validator to refuse.
+
+    Examples
+    --------
+    >>> times, unit = times_from_numbers(pd.Series([1577836800000, 1577836800200]))
+    >>> unit, str(times[1])
+    ('ms', '2020-01-01 00:00:00.200000+00:00')
+    """
+    numbers = values.to_numpy(dtype=np.float64, na_value=np.nan)
+    middle = float(np.nanmedian(np.abs(numbers))) if np.isfinite(numbers).any() else 0.0
+    unit = "s" if middle < 1e11 else "ms" if middle < 1e14 else "us" if middle < 1e17 else "ns"
+    per_second = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[unit]
+    missing = np.isnan(numbers)
+    if np.nanmax(np.abs(numbers), initial=0.0) >= 9.2e9 * per_second:
+        return pd.Series(numbers / per_second), unit
+    if pd.api.types.is_integer_dtype(values.dtype) and not missing.any():
+        nanoseconds = values.to_numpy(np.int64) * (10**9 // per_second)
+    else:
+        # A float64 holds the seconds of this century to a microsecond at best: do not invent nanoseconds.
+        nanoseconds = np.round(np.where(missing, 0.0, numbers) * (1e6 / per_second)).astype(np.int64) * 1000
+        nanoseconds[missing] = np.iinfo(np.int64).min
+    return pd.Series(nanoseconds.view("datetime64[ns]")).dt.tz_localize("UTC"), unit
+
+
+def _given_columns(
+    there: Sequence[str], given: Mapping[str, Any], ours: Sequence[str], where: object
+) -> dict[str, str]:
+    """Check the user's column map against our names and the file's."""
+    unknown = [name for name in given if name not in ours]
+    if unknown:
+        raise OptionError(f"columns names {', '.join(unknown)}", fix=f"the names are {', '.join(ours)}")
+    named = {name: "" if theirs is None else str(theirs) for name, theirs in given.items()}
+    missing = [f"{theirs!r} ({name})" for name, theirs in named.items() if theirs and theirs not in there]
+    if missing:
+        raise InputError(
+            f"there is no column {', '.join(missing)}", where=where, fix=f"the columns are {', '.join(there)}"
+        )
+    return named
+
+
+def _position_columns(
+    there: Sequence[str], chosen: Mapping[str, str], geometry: str | None, crs: CRS | None, faults: list[str]
+) -> tuple[dict[str, str], bool]:
+    """Find the coordinates: given ones, then the geometry column, then lon and lat, then x and y."""
+    if "geometry" in chosen:
+        return {"geometry": chosen["geometry"]}, False
+    if "x" in chosen and "y" in chosen:
+        by_name = _plain(chosen["x"]) in _LON_LAT[0] and _plain(chosen["y"]) in _LON_LAT[1]
+        return {"x": chosen["x"], "y": chosen["y"]}, by_name
+    if geometry is not None and "x" not in chosen and "y" not in chosen:
+        return {"geometry": geometry}, False
+    degrees_first = crs is None or crs.is_geographic
+    for names in (_LON_LAT, _PROJECTED) if degrees_first else (_PROJECTED, _LON_LAT):
+        pair = {}
+        for axis, usual in zip("xy", names, strict=True):
+            found = [chosen[axis]] if axis in chosen else _best([usual], there)
+            if len(found) > 1:
+                faults.append(_ambiguous(axis, found))
+            if found:
+                pair[axis] = found[0]
+        if len(pair) == 2:
+            return pair, names is _LON_LAT
+    found = _best([_GEOMETRY], there)
+    return ({"geometry": found[0]}, False) if len(found) == 1 else ({}, False)
+
+
+def _usual(name: str, there: Sequence[str], faults: list[str]) -> str | None:
+    """Find the one column with a usual name of ours, or say that there are several."""
+    if name in there:
+        return name
+    names = USUAL_NAMES[name]
+    split = names.index(None) if None in names else len(names)
+    found = _best([names[:split], names[split + 1 :]], there)
+    if len(found) > 1:
+        faults.append(_ambiguous(name, found))
+    return found[0] if found else None
+
+
+def _best(tiers: Sequence[Sequence[str | None]], there: Sequence[str]) -> list[str]:
+    """Return the columns whose names are in the first tier that has any."""
+    for tier in tiers:
+        found = [column for column in there if _plain(column) in tier]
+        if found:
+            return found
+    return []
+
+
+def _ambiguous(name: str, found: Sequence[str]) -> str:
+    return f"column {name!r} could be {', '.join(found)}; say which, for example --columns {name}={found[0]}"
+
+
+def _plain(name: str) -> str:
+    """Bring a name to lower case without separators and a namespace prefix."""
+    return "".join(letter for letter in name.lower().strip() if letter.isalnum())

@@ -1,0 +1,254 @@
+"""Reading fleet data: files or folders of any supported format in, one checked `Fleet` out."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from pyproj import CRS
+
+from probe2road.crs import WGS84, parse_crs, same_crs
+from probe2road.errors import CRSError, InputError, OptionError
+from probe2road.fleet import Fleet, fleet_from_checked
+from probe2road.fleet_tables import check_points, check_traces
+from probe2road.io.delimited import read_text_table
+from probe2road.io.gpx import read_gpx
+from probe2road.io.parquet import BBox, inside, read_parquet
+from probe2road.io.sources import RawTable, SourceFile, find_sources
+
+__all__ = ["read_fleet"]
+
+logger = logging.getLogger(__name__)
+
+Source = str | PathLike[str] | Sequence[str | PathLike[str]]
+
+_FILES_SHOWN = 10  # files with faults named in one error
+
+
+def read_fleet(
+    traces: Source,
+    points: Source | None = None,
+    *,
+    columns: Mapping[str, Any] | None = None,
+    point_columns: Mapping[str, Any] | None = None,
+    crs: Any = None,
+    target_crs: Any = None,
+    bbox: BBox | None = None,
+    delimiter: str | None = None,
+    header: bool = True,
+) -> Fleet:
+    r"""Read traces, and semantic points where there are any, and check everything.
+
+    Formats go by suffix: Parquet and GeoParquet (``.parquet``, ``.pq``, ``.geoparquet``), text tables
+    (``.csv``, ``.tsv``, ``.txt``, each also with ``.gz``) and GPX (``.gpx``, ``.gpx.gz``). A folder stands for
+    all of them in it and below; files called ``points`` or ``NAME.points`` are left out of the traces.
+
+    Traces are told apart by their ids across all files. A file without ids is one trace called like the
+    file, and in GPX every track segment is a trace called ``file/track/segment``.
+
+    Parameters
+    ----------
+    traces
+        A file, a folder, or a sequence of them. Trace columns are those of `Fleet`; times are ISO 8601 text,
+        timestamps, or numbers since 1970 in s, ms, us or ns (told by their size); without zone they are UTC.
+    points
+        Semantic points, likewise (not GPX). Kinds may have the names in `probe2road.io.columns.KIND_SYNONYMS`.
+    columns, point_columns
+        Our column name to the file's, for example ``{"trace_id": "trip"}``; ``geometry`` names a column of
+        points. An empty name says that there is no such column. What is not named is found by its usual name
+        (`probe2road.io.columns.USUAL_NAMES`), and logged.
+    crs
+        CRS of the coordinates in the files. Not needed where the file states it (GeoParquet, GPX) or the
+        columns are called longitude and latitude.
+    target_crs
+        Metric CRS to work in; see `probe2road.fleet.fleet_from_tables`.
+    bbox
+        ``(left, bottom, right, top)`` in the CRS of the files: only fixes and points inside are read. In
+        Parquet, row groups outside are skipped.
+    delimiter
+        Of text tables; told from the first line where it is None.
+    header
+        Whether text tables start with a line of names; without, the columns are called 0, 1, 2.
+
+    Returns
+    -------
+    Fleet
+        Sorted, deduplicated, in one metric CRS.
+
+    Raises
+    ------
+    InputError
+        Naming file, row and remedy, for everything that is wrong with the files: see
+        `probe2road.fleet.fleet_from_tables` for the faults of tables.
+    CRSError
+        If there is no CRS, if ``crs`` contradicts a file, or if the files have several.
+    OptionError
+        If ``bbox`` is no box or a column name is none of ours.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "drives.csv")
+    ...     _ = path.write_text("trip,time,lon,lat\n7,2024-05-01T08:00:00Z,-87.65,41.87\n")
+    ...     fleet = read_fleet(path)
+    >>> fleet.crs.to_epsg(), fleet.traces["trace_id"].tolist()
+    (32616, [7])
+    """
+    given = None if crs is None else parse_crs(crs)
+    box = None if bbox is None else _checked_bbox(bbox)
+    options = _Options(given, box, delimiter, header)
+    trace_table, trace_crs, told = _read_all(traces, columns or {}, options, points=False)
+    point_table, point_crs = None, trace_crs
+    if points is not None:
+        point_table, point_crs, _ = _read_all(points, point_columns or {}, options, points=True)
+    where = _name(traces)
+    fleet = fleet_from_checked(
+        trace_table, point_table, crs=trace_crs, points_crs=point_crs, target_crs=target_crs, where=where
+    )
+    logger.info(
+        "read %d fixes of %d traces and %d semantic points from %s (%s)",
+        *(len(fleet.traces), fleet.n_traces, len(fleet.points), where, told),
+    )
+    return fleet
+
+
+@dataclass(frozen=True)
+class _Options:
+    """What `read_fleet` was told about all files alike."""
+
+    crs: CRS | None
+    bbox: BBox | None
+    delimiter: str | None
+    header: bool
+
+
+def _checked_bbox(bbox: Sequence[float]) -> BBox:
+    """Return a bounding box of four ordered numbers."""
+    numbers = tuple(map(float, bbox))
+    if len(numbers) != 4 or not (numbers[0] < numbers[2] and numbers[1] < numbers[3]):
+        raise OptionError(f"bbox {numbers} is no box", fix="use (left, bottom, right, top), left < right, bottom < top")
+    return numbers
+
+
+def _read_all(
+    source: Source, columns: Mapping[str, Any], options: _Options, *, points: bool
+) -> tuple[pd.DataFrame, CRS, str]:
+    """Read and check all files of one kind of table; the table, its CRS, and what was guessed."""
+    files, left_out = find_sources(source, semantic_points=points)
+    if left_out:
+        logger.warning("left out %d files of semantic points; pass them as points", len(left_out))
+    tables: list[pd.DataFrame] = []
+    crs_of: dict[str, CRS] = {}
+    guesses: dict[str, None] = {}
+    errors: list[InputError] = []
+    for file in files:
+        try:
+            raw = _read_one(file, columns, options, points=points)
+            crs = _crs_of(raw, file, options.crs)
+            table = _checked_table(raw, file, crs, options.bbox, points=points)
+        except InputError as error:
+            errors.append(error)
+            continue
+        guesses |= dict.fromkeys(raw.guessed)
+        crs_of.setdefault(str(file.path), crs)
+        if len(table):
+            tables.append(table)
+    if errors:
+        raise _joined(errors, len(files))
+    crs = _one_crs(crs_of)
+    if not tables:
+        raise InputError(
+            f"no {'points' if points else 'fixes'} inside bbox {options.bbox}",
+            where=_name(source),
+            fix=f"bbox is (left, bottom, right, top) in the CRS of the data, {crs.name}",
+        )
+    told = f"found by name: {', '.join(guesses)}; CRS {crs.name}" if guesses else f"CRS {crs.name}"
+    return _concatenated(tables), crs, told
+
+
+def _read_one(file: SourceFile, columns: Mapping[str, Any], options: _Options, *, points: bool) -> RawTable:
+    """Read one file in its format."""
+    if file.format == "parquet":
+        return read_parquet(file, columns=columns, points=points, crs=options.crs, bbox=options.bbox)
+    if file.format == "text":
+        return read_text_table(
+            file,
+            columns=columns,
+            points=points,
+            crs=options.crs,
+            delimiter=options.delimiter,
+            header=options.header,
+        )
+    if points:
+        raise InputError("GPX holds no semantic points", where=file.path, fix="use a text table or Parquet")
+    return read_gpx(file)
+
+
+def _crs_of(raw: RawTable, file: SourceFile, given: CRS | None) -> CRS:
+    """Return the CRS of a file's coordinates: its own, the user's, or WGS84 by the columns' names."""
+    if raw.crs is not None and given is not None and not same_crs(raw.crs, given):
+        fault = f"the file is in {raw.crs.name}, which contradicts the CRS given, {given.name}"
+        raise CRSError(fault, where=file.path, fix="leave the CRS out, or correct the file")
+    crs = raw.crs or given or (WGS84 if raw.degrees else None)
+    if crs is None:
+        raise CRSError("no CRS", where=file.path, fix="say which one it is, for example --crs EPSG:32616")
+    return crs
+
+
+def _checked_table(raw: RawTable, file: SourceFile, crs: CRS, bbox: BBox | None, *, points: bool) -> pd.DataFrame:
+    """Check one file's table and cut it to the bounding box."""
+    table = raw.table
+    if bbox is not None and table.empty:
+        return table
+    if "trace_id" not in table and not points:
+        logger.warning("%s: no column of trace ids found: the file is one trace", file.path)
+        table = table.assign(trace_id=file.trace_name)
+    faults: list[str] = []
+    table = (check_points if points else check_traces)(table, crs, faults, origin=raw.origin)
+    if faults:
+        raise InputError.from_faults(faults, where=file.path)
+    keep = True if bbox is None else inside(table, bbox)
+    return table if np.all(keep) else table[keep].reset_index(drop=True)
+
+
+def _joined(errors: Sequence[InputError], n_files: int) -> InputError:
+    """Return one error for the faults of several files."""
+    if len(errors) == 1:
+        return errors[0]
+    shown = "".join(f"\n  {error}" for error in errors[:_FILES_SHOWN])
+    more = f"\n  and {len(errors) - _FILES_SHOWN} more" if len(errors) > _FILES_SHOWN else ""
+    kind = CRSError if all(isinstance(error, CRSError) for error in errors) else InputError
+    return kind(f"{len(errors)} of {n_files} files cannot be read{shown}{more}")
+
+
+def _one_crs(crs_of: Mapping[str, CRS]) -> CRS:
+    """Return the CRS that all files share."""
+    (first, crs), *others = crs_of.items()
+    for name, other in others:
+        if not same_crs(crs, other):
+            fault = f"mixed CRS: {first} is in {crs.name}, {name} in {other.name}"
+            raise CRSError(fault, fix="reproject the files to one CRS, or read them one by one")
+    return crs
+
+
+def _concatenated(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Join checked tables; ids become text where some files have numbers and others words."""
+    if len(tables) == 1:
+        return tables[0]
+    if len({table["trace_id"].dtype for table in tables}) > 1:
+        tables = [table.assign(trace_id=table["trace_id"].astype(str)) for table in tables]
+    return pd.concat(tables, ignore_index=True)
+
+
+def _name(source: Source) -> str:
+    """Name a source in a message."""
+    if isinstance(source, str | PathLike):
+        return str(source)
+    return f"{source[0]} and {len(source) - 1} more" if len(source) > 1 else str(source[0])

@@ -1,0 +1,126 @@
+"""Traces from GPX 1.0 and 1.1, streamed: a file is never held in memory as a tree.
+
+Strategy: expat calls back at the elements of a track point; the texts of positions, heights and times are
+collected in lists and converted together at the end. Routes and waypoints are no drives and are passed over.
+"""
+
+from __future__ import annotations
+
+import gzip
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+import pandas as pd
+
+from probe2road.crs import WGS84
+from probe2road.errors import InputError
+from probe2road.fleet_tables import TableOrigin
+from probe2road.io.sources import RawTable, SourceFile
+
+__all__ = ["read_gpx"]
+
+_VALUES = {"ele": "z", "time": "t", "speed": "speed", "course": "heading"}  # children of a track point, at any depth
+
+
+def read_gpx(source: SourceFile) -> RawTable:
+    """Read the track points of one GPX file.
+
+    Every track segment is a trace, called ``name of the file/number of the track/number of the segment``,
+    both counted from 0. Speed and course are read where GPX 1.0 or a common extension of 1.1 has them.
+
+    Parameters
+    ----------
+    source
+        File with suffix ``.gpx`` or ``.gpx.gz``.
+
+    Returns
+    -------
+    RawTable
+        In longitude and latitude, with ``t`` only where at least one point has a time.
+
+    Raises
+    ------
+    InputError
+        If the XML is broken (with the line), the file is no GPX, or it has no track points.
+    """
+    lists = _parse(source)
+    if not lists["lon"]:
+        fault = "no track points (routes and waypoints are not traces)"
+        raise InputError(fault, where=source.path, fix="export the tracks")
+    names = pd.array([f"{source.trace_name}/{track}/{segment}" for track, segment in lists["segment"]], dtype="str")
+    counts = np.diff([*lists["start"], len(lists["lon"])])
+    table = {"trace_id": pd.Series(names.take(np.repeat(np.arange(len(counts)), counts)))}
+    table |= {"x": _numbers(lists["lon"]), "y": _numbers(lists["lat"])}
+    for tag, name in _VALUES.items():
+        values = lists[tag]
+        if values.count(None) < len(values):
+            table[name] = pd.Series(values, dtype=object) if tag == "time" else _numbers(values)
+    columns = {"x": "lon", "y": "lat", "z": "ele", "t": "time", "heading": "course"}
+    return RawTable(pd.DataFrame(table), WGS84, True, TableOrigin("traces", "track point", 0, columns))
+
+
+def _parse(source: SourceFile) -> dict[str, list[Any]]:
+    """Return the texts of all track points, and the numbers and first points of their segments."""
+    lists: dict[str, list[Any]] = {name: [] for name in ("lon", "lat", *_VALUES, "segment", "start")}
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    _connect(parser, lists, source)
+    try:
+        with gzip.open(source.path) if source.path.suffix.lower() == ".gz" else source.path.open("rb") as file:
+            parser.ParseFile(file)
+    except expat.ExpatError as error:
+        fault = f"broken XML at line {error.lineno}, column {error.offset + 1}: {expat.ErrorString(error.code)}"
+        raise InputError(fault, where=source.path, fix="repair that line, or export the file again") from error
+    except (OSError, EOFError) as error:
+        raise InputError(f"broken gzip ({error})", where=source.path, fix="copy the file again") from error
+    return lists
+
+
+def _connect(parser: expat.XMLParserType, lists: dict[str, list[Any]], source: SourceFile) -> None:
+    """Let the parser fill the lists."""
+    lon, lat, values = lists["lon"], lists["lat"], [lists[tag] for tag in _VALUES]
+    text: list[str] = []
+    state = {"track": -1, "segment": -1, "point": False, "root": False}
+
+    def start(name: str, attributes: dict[str, str]) -> None:
+        tag = name.rpartition(":")[2]
+        if tag == "trkpt":
+            state["point"] = True
+            lon.append(attributes.get("lon"))
+            lat.append(attributes.get("lat"))
+            for column in values:
+                column.append(None)
+        elif tag in _VALUES:
+            if state["point"]:
+                parser.CharacterDataHandler = text.append
+        elif tag == "trkseg":
+            state["segment"] += 1
+            lists["segment"].append((state["track"], state["segment"]))
+            lists["start"].append(len(lon))
+        elif tag == "trk":
+            state["track"] += 1
+            state["segment"] = -1
+        elif not state["root"] and tag != "gpx":
+            raise InputError(f"the root element is <{name}>, not <gpx>", where=source.path, fix="check its suffix")
+        state["root"] = True
+
+    def end(name: str) -> None:
+        tag = name.rpartition(":")[2]
+        if tag == "trkpt":
+            state["point"] = False
+        elif tag in _VALUES and state["point"]:
+            lists[tag][-1] = "".join(text).strip() or None
+            text.clear()
+            parser.CharacterDataHandler = None
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+
+
+def _numbers(texts: list[str | None]) -> Any:
+    """Convert texts to float64, missing ones to NaN; the texts themselves where one is no number."""
+    try:
+        return np.array(["nan" if text is None else text for text in texts], np.float64)
+    except ValueError:
+        return pd.Series(texts, dtype=object)

@@ -1,0 +1,142 @@
+"""Fleet data from Parquet and GeoParquet: only the columns and row groups that are needed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.dataset as ds
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from probe2road.crs import parse_crs
+from probe2road.errors import InputError
+from probe2road.fleet_tables import TableOrigin
+from probe2road.io.columns import ColumnChoice, choose_columns, standard_kinds, times_from_numbers
+from probe2road.io.sources import RawTable, SourceFile
+from probe2road.io.wkb import point_coordinates
+
+__all__ = ["inside", "read_parquet"]
+
+BBox = tuple[float, float, float, float]
+
+_DEFAULT_CRS = "OGC:CRS84"  # GeoParquet 1.1: what a geometry column without a "crs" is in
+
+
+def read_parquet(
+    source: SourceFile,
+    *,
+    columns: Mapping[str, Any] | None = None,
+    points: bool = False,
+    crs: CRS | None = None,
+    bbox: BBox | None = None,
+) -> RawTable:
+    """Read one Parquet or GeoParquet file.
+
+    A geometry column of points (WKB, or GeoArrow as GeoParquet 1.1 allows it) is preferred to coordinate
+    columns that the user did not name, and brings its CRS. Folder names of the form ``key=value`` count as
+    columns. ``bbox`` skips row groups where the file has statistics of coordinate columns or of a covering.
+
+    Parameters
+    ----------
+    source, columns, points, crs, bbox
+        As for `probe2road.read_fleet`.
+
+    Returns
+    -------
+    RawTable
+        May have no rows.
+
+    Raises
+    ------
+    InputError
+        If the file is no complete Parquet file, or its columns cannot be told.
+    """
+    try:
+        dataset = ds.dataset(str(source.path), format="parquet", partitioning="hive")
+        geo = _geo_metadata(dataset.schema, source)
+        geometry = geo["primary_column"] if geo else None
+        choice = choose_columns(
+            dataset.schema.names, columns, points=points, geometry=geometry, crs=crs, where=source.path
+        )
+        about = geo["columns"].get(choice.columns.get("geometry"), {}) if geo else {}
+        condition = None if bbox is None else _row_filter(choice, about, dataset.schema, bbox)
+        wanted = list(dict.fromkeys(choice.columns.values()))
+        content = dataset.to_table(columns=wanted, filter=condition)
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError, OSError) as error:
+        reason = str(error).splitlines()[0]
+        fix = "it may be truncated; copy or write it again"
+        raise InputError(f"not a readable Parquet file ({reason})", where=source.path, fix=fix) from error
+    table, unit = _our_columns(content, choice, source)
+    if bbox is not None:
+        table = table[inside(table, bbox)].reset_index(drop=True)
+    file_crs = _crs_of(about, source) if "geometry" in choice.columns and geo else None
+    guessed = tuple(f"{name}={choice.columns[name]}" for name in choice.guessed)
+    names = {name: choice.columns.get(name, name) for name in table}
+    origin = TableOrigin("points" if points else "traces", columns=names)
+    return RawTable(table, file_crs, choice.degrees, origin, (*guessed, *([f"t in {unit}"] if unit else [])))
+
+
+def inside(table: pd.DataFrame, bbox: BBox) -> NDArray[np.bool_]:
+    """Mark the rows whose ``x`` and ``y`` lie in the box, its border included; all where they are no numbers."""
+    if not all(pd.api.types.is_numeric_dtype(table[axis].dtype) for axis in "xy"):
+        return np.ones(len(table), bool)
+    left, bottom, right, top = bbox
+    x, y = (table[axis].to_numpy(np.float64, na_value=np.nan) for axis in "xy")
+    return np.asarray((x >= left) & (x <= right) & (y >= bottom) & (y <= top), bool)
+
+
+def _geo_metadata(schema: pa.Schema, source: SourceFile) -> dict[str, Any] | None:
+    """Return the GeoParquet metadata of a file, None where it has none."""
+    raw = (schema.metadata or {}).get(b"geo")
+    if raw is None:
+        return None
+    try:
+        geo = json.loads(raw)
+        return {"primary_column": geo["primary_column"], "columns": dict(geo["columns"])}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError("the GeoParquet metadata is broken", where=source.path, fix="write the file again") from error
+
+
+def _crs_of(about: Mapping[str, Any], source: SourceFile) -> CRS | None:
+    """Return the CRS of a geometry column: absent means longitude and latitude, null means unknown."""
+    value = about.get("crs", _DEFAULT_CRS)
+    return None if value is None else parse_crs(value, where=source.path)
+
+
+def _row_filter(choice: ColumnChoice, about: Mapping[str, Any], schema: pa.Schema, bbox: BBox) -> ds.Expression | None:
+    """Return the condition that Parquet statistics can prove false for a row group, None where there is none."""
+    left, bottom, right, top = bbox
+    geometry = choice.columns.get("geometry")
+    covering = about.get("covering", {}).get("bbox")
+    if geometry is None:
+        x_min = x_max = ds.field(choice.columns["x"])
+        y_min = y_max = ds.field(choice.columns["y"])
+    elif pa.types.is_struct(schema.field(geometry).type):
+        x_min = x_max = ds.field(geometry, "x")
+        y_min = y_max = ds.field(geometry, "y")
+    elif covering:
+        x_min, x_max, y_min, y_max = (ds.field(*covering[side]) for side in ("xmin", "xmax", "ymin", "ymax"))
+    else:
+        return None
+    return (x_max >= left) & (x_min <= right) & (y_max >= bottom) & (y_min <= top)
+
+
+def _our_columns(content: pa.Table, choice: ColumnChoice, source: SourceFile) -> tuple[pd.DataFrame, str]:
+    """Rename the columns to ours, unpack the geometry and read numeric times; and the unit of those times."""
+    table: dict[str, Any] = {}
+    unit = ""
+    for name, theirs in choice.columns.items():
+        column = content.column(theirs)
+        if name == "geometry":
+            table |= point_coordinates(column, name=theirs, where=source.path)
+            continue
+        values = column.to_pandas()
+        if name == "t" and pd.api.types.is_numeric_dtype(values.dtype):
+            values, unit = times_from_numbers(values)
+        table[name] = standard_kinds(values) if name == "kind" else values.reset_index(drop=True)
+    return pd.DataFrame(table, copy=False), unit
