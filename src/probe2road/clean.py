@@ -2,32 +2,248 @@
 
 Strategy
 --------
-A graph is taken apart into flat arrays: node rows ``u`` and ``v`` of every edge, and one long coordinate array
-with offsets. An edge has two ends; end ``2 e`` is where edge ``e`` starts, end ``2 e + 1`` where it stops, so
-``end // 2`` is the edge and ``end ^ 1`` the other end. Every step works on all edges at once, returns a new
-graph, and returns its input itself where there is nothing to do: that is how `clean_graph` knows that it has
-reached the fixed point.
+Every step takes the graph apart into flat arrays (see `probe2road.topology`), works on all edges at once, and
+returns a new graph, or its input itself where there is nothing to do: that is how `clean_graph` knows that it
+has reached the fixed point. Each step that does something leaves fewer nodes or edges, so there is one.
 """
 
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
+import geopandas as gpd
 import numpy as np
 import pandas as pd
 import shapely
-from numba import njit
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
+from probe2road.errors import OptionError
 from probe2road.roadgraph import RoadGraph, finish_edges
+from probe2road.topology import Network, chains, contract_short_edges, end_nodes, mates
 
-__all__ = ["merge_degree_two_nodes"]
+__all__ = [
+    "CleanOptions",
+    "clean_graph",
+    "collapse_short_edges",
+    "drop_dead_ends",
+    "drop_small_components",
+    "merge_degree_two_nodes",
+]
 
 logger = logging.getLogger(__name__)
 
 _STRENGTH = {"segmentation": 0, "reference": 1, "gap": 2}  # a chain takes the origin of its least doubtful member
+
+
+@dataclass(frozen=True)
+class CleanOptions:
+    """What counts as a flaw of a graph."""
+
+    short_edge: float = 15.0  # m; edges between junctions up to this long are collapsed; 0 keeps all
+    max_ring: float = 120.0  # m; rings with a perimeter of 2 short_edge up to this keep their edges
+    dead_end: float = 15.0  # m; shorter dead ends and isolated edges are dropped; 0 keeps all
+    component: float = 15.0  # m; shorter components are dropped; 0 keeps all
+
+    def __post_init__(self) -> None:
+        """Refuse negative lengths."""
+        for name in ("short_edge", "max_ring", "dead_end", "component"):
+            _require_length(getattr(self, name), name)
+
+
+def clean_graph(graph: RoadGraph, options: CleanOptions | None = None) -> RoadGraph:
+    """Clean a graph until nothing changes any more.
+
+    Each round drops small components and short dead ends, then collapses short edges between junctions, then
+    merges nodes of degree 2. Dead ends go first because a spur cuts a road into short edges that are none once
+    it is gone. Cleaning a clean graph returns it as it is. An empty graph stays empty.
+
+    Parameters
+    ----------
+    graph
+        Any road graph.
+    options
+        The defaults where it is None.
+
+    Returns
+    -------
+    RoadGraph
+        Attributes and turns are those of `merge_degree_two_nodes`; turns from, to or over removed edges are
+        dropped, and turns at collapsed junctions move to the node that replaces them.
+
+    Notes
+    -----
+    METHOD 0.1 rows 25 to 27.
+
+    Examples
+    --------
+    A road with a spur of 4 m is one road:
+
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> lines = [[(0, 0), (50, 0)], [(50, 0), (50, 4)], [(50, 0), (99, 0)]]
+    >>> clean_graph(graph_from_lines(lines, crs="EPSG:32616")).edges["length"].tolist()
+    [99.0]
+    """
+    options = options or CleanOptions()
+    before, done = graph, None
+    while done is not graph:
+        done = graph
+        graph = drop_small_components(graph, min_length=options.component)
+        graph = drop_dead_ends(graph, min_length=options.dead_end)
+        graph = collapse_short_edges(graph, max_length=options.short_edge, max_ring=options.max_ring)
+        graph = merge_degree_two_nodes(graph)
+    logger.info("cleaned %d edges (%.3f km) to %d", len(before.edges), before.length / 1000, len(graph.edges))
+    return graph
+
+
+def drop_small_components(graph: RoadGraph, *, min_length: float = 15.0) -> RoadGraph:
+    """Drop connected components with a total length below ``min_length`` (m); turns on them go with them.
+
+    Raises
+    ------
+    OptionError
+        If the length is negative.
+
+    Examples
+    --------
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(0, 0), (9, 0)], [(50, 0), (99, 0)]], crs="EPSG:32616")
+    >>> drop_small_components(graph).edges["length"].to_dict()
+    {1: 49.0}
+    """
+    _require_length(min_length, "min_length")
+    u, v = _end_rows(graph)
+    n_nodes = len(graph.nodes)
+    adjacency = coo_array((np.ones(len(u), bool), (u, v)), shape=(n_nodes, n_nodes))
+    _, component = connected_components(adjacency, directed=False) if n_nodes else (0, np.zeros(0, np.int64))
+    total = np.bincount(component[u], weights=graph.edges["length"], minlength=n_nodes)
+    return _without_edges(graph, total[component[u]] < min_length, why=f"in components shorter than {min_length:g} m")
+
+
+def drop_dead_ends(graph: RoadGraph, *, min_length: float = 15.0) -> RoadGraph:
+    """Drop dead ends shorter than ``min_length`` (m), and isolated edges as short, to a fixed point.
+
+    Lengths are measured up to the junction: nodes of degree 2 are merged first, and again after each round. At a
+    junction the shortest go first and two ends always stay. A road that ends in a fork of two spurs so keeps the
+    longer one as its end and is not eaten up from there spur by spur, and a star of short edges keeps its two
+    longest, which then are one edge. Loops are no dead ends.
+
+    Parameters
+    ----------
+    graph
+        Any road graph.
+    min_length
+        Metres; 0 only merges.
+
+    Returns
+    -------
+    RoadGraph
+        Without nodes of degree 2; attributes and turns as for `merge_degree_two_nodes`, and turns on dropped edges
+        dropped.
+
+    Raises
+    ------
+    OptionError
+        If the length is negative.
+
+    Notes
+    -----
+    METHOD 0.1 row 26.
+
+    Examples
+    --------
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> fork = [[(0, 0), (50, 0)], [(50, 0), (54, 3)], [(50, 0), (54, -4)]]
+    >>> print(drop_dead_ends(graph_from_lines(fork, crs="EPSG:32616")).edges.geometry.iloc[0])
+    LINESTRING (0 0, 50 0, 54 -4)
+    """
+    _require_length(min_length, "min_length")
+    done = None
+    while done is not graph:
+        graph = done = merge_degree_two_nodes(graph)
+        u, v = _end_rows(graph)
+        degree = np.bincount(end_nodes(u, v), minlength=len(graph.nodes))
+        length = graph.edges["length"].to_numpy()
+        tips = (degree[u] == 1).astype(int) + (degree[v] == 1)
+        spur = np.flatnonzero((tips == 1) & (length < min_length))
+        junction = np.where(degree[u[spur]] == 1, v[spur], u[spur])
+        order = np.lexsort([length[spur], junction])
+        spur, junction = spur[order], junction[order]
+        rank = np.arange(len(spur)) - np.searchsorted(junction, junction)  # shortest at its junction: 0
+        dropped = (tips == 2) & (length < min_length)
+        dropped[spur[rank < degree[junction] - 2]] = True
+        graph = _without_edges(graph, dropped, why=f"in dead ends shorter than {min_length:g} m")
+    return graph
+
+
+def collapse_short_edges(graph: RoadGraph, *, max_length: float = 15.0, max_ring: float = 120.0) -> RoadGraph:
+    """Collapse edges of at most ``max_length`` (m) between two junctions, shortest first, to a fixed point.
+
+    Two junctions become one in the middle, weighted by the number of junctions that went into each. Around
+    it, within the distance of the two, the other edges are replaced by straight lines to it, so that they do not
+    double back. Edges with a dead end are never collapsed, nor are loops.
+
+    A collapse may shrink a ring, but must not destroy a road: edges whose smallest ring is longer than ``2
+    max_length`` and at most ``max_ring`` stay, which keeps roundabouts, islands and small blocks as they are. On
+    a longer ring a short edge is a small part. A shorter ring is a hole in the mask, narrower than a road, and
+    collapses with its edges.
+
+    Parameters
+    ----------
+    graph
+        Any road graph; its nodes of degree 2 are merged first, for a short edge may be a chain.
+    max_length, max_ring
+        Metres; a ``max_length`` of 0 only merges.
+
+    Returns
+    -------
+    RoadGraph
+        Edges keep ids and attributes, a new junction has the id of the first of its old ones in table order.
+        Turns move to the new junctions; those from or to collapsed edges are dropped.
+
+    Raises
+    ------
+    OptionError
+        If a length is negative.
+
+    Notes
+    -----
+    METHOD 0.1 row 25 and 7.3: thinning leaves such edges where roads cross. Length alone cannot tell them from
+    real short links, so keep ``max_length`` low where traces are not consulted.
+
+    Examples
+    --------
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> cross = [[(0, 40), (40, 3)], [(0, -40), (40, 3)], [(40, 3), (44, 3)], [(44, 3), (84, 40)], [(44, 3), (84, -40)]]
+    >>> graph = collapse_short_edges(graph_from_lines(cross, crs="EPSG:32616"))
+    >>> print(graph.nodes.geometry[1], graph.degrees()[1])
+    POINT (42 3) 4
+    """
+    _require_length(max_length, "max_length")
+    _require_length(max_ring, "max_ring")
+    graph = merge_degree_two_nodes(graph)
+    network, stands_for = contract_short_edges(_network(graph), max_length=max_length, max_ring=max_ring)
+    if len(network.edge) == len(graph.edges):
+        return graph
+    node = graph.nodes.index.to_numpy()
+    line = np.repeat(np.arange(len(network.edge)), np.diff(network.offsets))
+    edges = graph.edges.iloc[network.edge].assign(
+        u=node[network.u], v=node[network.v], geometry=shapely.linestrings(network.vertices, indices=line)
+    )
+    points = graph.nodes.geometry.to_numpy().copy()
+    grown = network.weight > 1
+    points[grown] = shapely.points(network.position[grown])
+    turns = _renamed_turns(
+        graph.turns,
+        edges=pd.Series(edges.index, index=edges.index),
+        nodes=pd.Series(node[stands_for], index=graph.nodes.index),
+    )
+    logger.info("collapsed %d edges up to %g m between junctions", len(graph.edges) - len(edges), max_length)
+    nodes = _nodes_with_edges(graph.nodes.set_geometry(points, crs=graph.crs), graph.edges, edges)
+    return replace(graph, nodes=nodes, edges=finish_edges(edges), turns=turns)
 
 
 def merge_degree_two_nodes(graph: RoadGraph) -> RoadGraph:
@@ -69,10 +285,10 @@ def merge_degree_two_nodes(graph: RoadGraph) -> RoadGraph:
     [[0.0, 0.0, 36.0]]
     """
     u, v = _end_rows(graph)
-    mate = _mates(u, v)
+    mate = mates(u, v)
     if not (mate >= 0).any():
         return graph
-    members, backwards, starts = _chains(mate)
+    members, backwards, starts = chains(mate)
     stops = np.append(starts[1:], len(members))
     first, last = members[starts], members[stops - 1]
     # The first member in table order names the chain; the walk runs in its direction.
@@ -86,13 +302,11 @@ def merge_degree_two_nodes(graph: RoadGraph) -> RoadGraph:
     )
     chain = np.empty(len(members), np.int64)
     chain[members] = np.repeat(graph.edges.index.to_numpy()[name], stops - starts)
-    kept = np.ones(len(node), bool)
-    kept[u], kept[v] = False, False
-    kept |= np.isin(node, merged[["u", "v"]].to_numpy())
-    turns = graph.turns[graph.turns["via_node"].isin(node[kept])]
+    nodes = _nodes_with_edges(graph.nodes, graph.edges, merged)
+    turns = graph.turns[graph.turns["via_node"].isin(nodes.index)]
     turns = _renamed_turns(turns, edges=pd.Series(chain, index=graph.edges.index))
-    logger.info("merged %d nodes of degree 2, %d edges left", (~kept).sum(), len(merged))
-    return replace(graph, nodes=graph.nodes[kept], edges=finish_edges(merged), turns=turns)
+    logger.info("merged %d nodes of degree 2, %d edges left", len(node) - len(nodes), len(merged))
+    return replace(graph, nodes=nodes, edges=finish_edges(merged), turns=turns)
 
 
 def _end_rows(graph: RoadGraph) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -101,47 +315,43 @@ def _end_rows(graph: RoadGraph) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return row[graph.edges["u"]].to_numpy(), row[graph.edges["v"]].to_numpy()
 
 
-def _mates(u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return, per end, the other end at its node where the node joins exactly two edges, else -1."""
-    node = np.stack([u, v], axis=1).reshape(-1)
-    order = np.argsort(node, kind="stable")
-    heads = np.flatnonzero(np.diff(node[order], prepend=-1))
-    pairs = heads[np.diff(np.append(heads, len(order))) == 2]
-    one, other = order[pairs], order[pairs + 1]
-    distinct = one // 2 != other // 2  # the two ends of a loop have nothing to join
-    mate = np.full(len(node), -1)
-    mate[one[distinct]], mate[other[distinct]] = other[distinct], one[distinct]
-    return mate
+def _network(graph: RoadGraph) -> Network:
+    """Take a graph apart into arrays; heights stay with the vertices."""
+    u, v = _end_rows(graph)
+    lines = graph.edges.geometry.to_numpy()
+    vertices = shapely.get_coordinates(lines, include_z=bool(shapely.has_z(lines).any()))
+    return Network(
+        position=shapely.get_coordinates(graph.nodes.geometry.to_numpy()),
+        u=u,
+        v=v,
+        vertices=vertices,
+        offsets=np.concatenate([[0], np.cumsum(shapely.get_num_coordinates(lines))]),
+        edge=np.arange(len(u)),
+        weight=np.ones(len(graph.nodes), np.int64),
+    )
 
 
-@njit(cache=True)
-def _chains(mate: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.int64]]:
-    """Walk every chain of mated ends in the direction of its first edge.
+def _without_edges(graph: RoadGraph, dropped: NDArray[np.bool_], *, why: str) -> RoadGraph:
+    """Drop edges, the nodes that lose their last edge, and the turns on them; the graph itself where none is."""
+    if not dropped.any():
+        return graph
+    edges = graph.edges[~dropped]
+    lost = graph.edges.index[dropped]
+    turns = graph.turns[~(graph.turns["from_edge"].isin(lost) | graph.turns["to_edge"].isin(lost))]
+    logger.info("removed %d edges %s", len(lost), why)
+    nodes = _nodes_with_edges(graph.nodes, graph.edges, edges)
+    return replace(graph, nodes=nodes, edges=finish_edges(edges), turns=turns)
 
-    Returns the members chain by chain, whether each is passed backwards, and where each chain starts.
-    """
-    n_edges = len(mate) // 2
-    members = np.empty(n_edges, np.int64)
-    backwards = np.empty(n_edges, np.bool_)
-    starts = np.empty(n_edges, np.int64)
-    seen = np.zeros(n_edges, np.bool_)
-    filled = n_chains = 0
-    for edge in range(n_edges):
-        if seen[edge]:
-            continue
-        end = 2 * edge
-        while mate[end] >= 0:  # back to where the chain begins, or once around a ring
-            end = mate[end] ^ 1
-            if end == 2 * edge:
-                break
-        starts[n_chains] = filled
-        n_chains += 1
-        while end >= 0 and not seen[end // 2]:
-            seen[end // 2] = True
-            members[filled], backwards[filled] = end // 2, end % 2 == 1
-            filled += 1
-            end = mate[end ^ 1]
-    return members, backwards, starts[:n_chains]
+
+def _nodes_with_edges(nodes: gpd.GeoDataFrame, before: pd.DataFrame, after: pd.DataFrame) -> gpd.GeoDataFrame:
+    """Drop the nodes that have lost their last edge."""
+    had, has = (nodes.index.isin(np.unique(edges[["u", "v"]])) for edges in (before, after))
+    return nodes[has | ~had]
+
+
+def _require_length(value: float, name: str) -> None:
+    if not 0 <= value < np.inf:
+        raise OptionError(f"{name} is {value}", where="clean", fix="use 0 m or more")
 
 
 def _joined_lines(
