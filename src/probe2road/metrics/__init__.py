@@ -1,0 +1,43 @@
+"""Scores of a proposed road graph, or of a mask, against a reference.
+
+Each metric has a module, a frozen dataclass of parameters, and a function of two road graphs; `evaluate` runs
+several of them on graphs that are normalised once.
+"""
+
+from __future__ import annotations
+
+from probe2road.metrics.apls import AplsOptions, apls
+from probe2road.metrics.buffer import BufferGeoOptions, buffer_geo
+from probe2road.metrics.evaluate import DEFAULT_METRICS, METRICS, evaluate
+from probe2road.metrics.geo import HE_BALAKRISHNAN_2022, GeoOptions, geo
+from probe2road.metrics.graph_sampling import GraphSamplingOptions, graph_sampling
+from probe2road.metrics.itopo import ItopoOptions, itopo
+from probe2road.metrics.normalise import clip_graph, comparable
+from probe2road.metrics.scores import SCORE_DTYPES, Score, scores_table
+from probe2road.metrics.soft_f1 import soft_f1
+from probe2road.metrics.topo import TopoOptions, topo
+
+__all__ = [
+    "DEFAULT_METRICS",
+    "HE_BALAKRISHNAN_2022",
+    "METRICS",
+    "SCORE_DTYPES",
+    "AplsOptions",
+    "BufferGeoOptions",
+    "GeoOptions",
+    "GraphSamplingOptions",
+    "ItopoOptions",
+    "Score",
+    "TopoOptions",
+    "apls",
+    "buffer_geo",
+    "clip_graph",
+    "comparable",
+    "evaluate",
+    "geo",
+    "graph_sampling",
+    "itopo",
+    "scores_table",
+    "soft_f1",
+    "topo",
+]

@@ -1,0 +1,115 @@
+"""The one entry: any number of metrics of one proposal against one reference."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from time import perf_counter
+from typing import Any
+
+import pandas as pd
+
+from probe2road.errors import OptionError
+from probe2road.metrics.apls import AplsOptions, apls_networks
+from probe2road.metrics.buffer import BufferGeoOptions, buffer_geo_networks
+from probe2road.metrics.geo import GeoOptions, geo_networks
+from probe2road.metrics.graph_sampling import GraphSamplingOptions, graph_sampling_networks
+from probe2road.metrics.itopo import ItopoOptions, itopo_networks
+from probe2road.metrics.normalise import comparable_networks
+from probe2road.metrics.scores import Score, scores_table
+from probe2road.metrics.topo import TopoOptions, topo_networks
+from probe2road.roadgraph import RoadGraph
+
+__all__ = ["DEFAULT_METRICS", "METRICS", "MetricOptions", "evaluate"]
+
+logger = logging.getLogger(__name__)
+
+MetricOptions = GeoOptions | ItopoOptions | TopoOptions | AplsOptions | BufferGeoOptions | GraphSamplingOptions
+
+# The short names of metrics with their default parameters, for the command line and for quick calls.
+METRICS: dict[str, MetricOptions] = {
+    "geo": GeoOptions(),
+    "itopo": ItopoOptions(),
+    "itopo_strict": ItopoOptions(strict=True),
+    "topo": TopoOptions(),
+    "apls": AplsOptions(),
+    "buffer_geo": BufferGeoOptions(),
+    "graph_sampling": GraphSamplingOptions(),
+}
+DEFAULT_METRICS = ("geo", "itopo", "itopo_strict", "topo", "apls")
+
+_SCORERS: dict[type, Callable[..., Score | list[Score]]] = {
+    GeoOptions: geo_networks,
+    ItopoOptions: itopo_networks,
+    TopoOptions: topo_networks,
+    AplsOptions: apls_networks,
+    BufferGeoOptions: buffer_geo_networks,
+    GraphSamplingOptions: graph_sampling_networks,
+}
+
+
+def evaluate(
+    proposal: RoadGraph,
+    reference: RoadGraph,
+    *,
+    metrics: Sequence[str | MetricOptions] = DEFAULT_METRICS,
+    area: Any = None,
+    merge: bool = True,
+) -> pd.DataFrame:
+    """Score a proposal against a reference.
+
+    Parameters
+    ----------
+    proposal, reference
+        Road graphs in metric CRS; the proposal is reprojected to the CRS of the reference. Either may be empty and
+        then scores 0.
+    metrics
+        Names out of `METRICS`, or options of a metric where its defaults do not suit: ``["geo",
+        GeoOptions(radius=15)]`` scores twice.
+    area
+        Clip both graphs to this polygon or ``(left, bottom, right, top)`` first, in the CRS of the reference.
+    merge
+        Whether to merge nodes of degree 2 first. Without it scores depend on how edges are cut.
+
+    Returns
+    -------
+    DataFrame
+        One row per score, see `SCORE_DTYPES`; parameters are JSON.
+
+    Raises
+    ------
+    CRSError
+        If a graph is not in metres.
+    OptionError
+        If a metric is unknown.
+
+    Examples
+    --------
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 50)]], crs="EPSG:32616")
+    >>> evaluate(graph, graph, metrics=["geo", GeoOptions(radius=15.0)])[["metric", "f1", "reference"]]
+      metric   f1  reference
+    0    geo  1.0       15.0
+    1    geo  1.0       15.0
+    """
+    options = [_resolve(metric) for metric in metrics]
+    first, second = comparable_networks(proposal, reference, area=area, merge=merge)
+    scores: list[Score] = []
+    for option in options:
+        started = perf_counter()
+        result = _SCORERS[type(option)](first, second, option)
+        scores += result if isinstance(result, list) else [result]
+        logger.info("%s, %.1f s", scores[-1], perf_counter() - started)
+    return scores_table(scores)
+
+
+def _resolve(metric: str | MetricOptions) -> MetricOptions:
+    if isinstance(metric, str):
+        if metric not in METRICS:
+            raise OptionError(f"there is no metric {metric!r}", where="evaluate", fix=f"use {', '.join(METRICS)}")
+        return METRICS[metric]
+    if type(metric) not in _SCORERS:
+        raise OptionError(
+            f"{type(metric).__name__} are not options of a metric", where="evaluate", fix="use GeoOptions or alike"
+        )
+    return metric
