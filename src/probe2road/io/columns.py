@@ -65,7 +65,7 @@ class ColumnChoice:
     """The columns to read from one file."""
 
     columns: dict[str, str]  # our name -> the file's; "geometry" stands for x, y and z in one column
-    guessed: tuple[str, ...]  # our names that were found by usual name
+    guessed: tuple[str, ...]  # our names that were found under another, usual name
     degrees: bool  # the coordinates are longitude and latitude by name
 
 
@@ -120,6 +120,7 @@ def choose_columns(
     probe2road.errors.InputError: drives.csv: column 't' could be ts, time; say which, for example --columns t=ts
     """
     ours = (*POINT_COLUMNS, *POINT_OPTIONAL_COLUMNS) if points else (*TRACE_COLUMNS, *TRACE_OPTIONAL_COLUMNS)
+    there = list(dict.fromkeys(there))
     named = _given_columns(there, given or {}, (*ours, "geometry"), where)
     left_out = {name for name, theirs in named.items() if not theirs}
     chosen = {name: theirs for name, theirs in named.items() if theirs}
@@ -136,7 +137,7 @@ def choose_columns(
     chosen |= position
     needed = {"x", "y", "trace_id", "kind"} if points else {"x", "y"}
     missing = [name for name in ours if name in needed - in_geometry - set(chosen)]
-    if missing and not faults:
+    if missing:
         example = ",".join(f"{name}=NAME" for name in missing)
         faults.append(
             f"no column for {', '.join(missing)} (the columns are {', '.join(there)}); "
@@ -145,7 +146,8 @@ def choose_columns(
     if faults:
         raise InputError.from_faults(faults, where=where)
     ordered = {name: chosen[name] for name in (*ours, "geometry") if name in chosen}
-    return ColumnChoice(ordered, tuple(name for name in ordered if name not in named), degrees)
+    guessed = tuple(name for name, theirs in ordered.items() if name not in named and name != theirs)
+    return ColumnChoice(ordered, guessed, degrees)
 
 
 def standard_kinds(values: pd.Series) -> pd.Series:
@@ -224,18 +226,19 @@ def _position_columns(
     if geometry is not None and "x" not in chosen and "y" not in chosen:
         return {"geometry": geometry}, False
     degrees_first = crs is None or crs.is_geographic
+    partial: dict[str, str] = {}
     for names in (_LON_LAT, _PROJECTED) if degrees_first else (_PROJECTED, _LON_LAT):
-        pair = {}
-        for axis, usual in zip("xy", names, strict=True):
-            found = [chosen[axis]] if axis in chosen else _best([usual], there)
-            if len(found) > 1:
-                faults.append(_ambiguous(axis, found))
-            if found:
-                pair[axis] = found[0]
+        found = {
+            axis: [chosen[axis]] if axis in chosen else _best([usual], there)
+            for axis, usual in zip("xy", names, strict=True)
+        }
+        pair = {axis: columns[0] for axis, columns in found.items() if columns}
         if len(pair) == 2:
+            faults += [_ambiguous(axis, columns) for axis, columns in found.items() if len(columns) > 1]
             return pair, names is _LON_LAT
-    found = _best([_GEOMETRY], there)
-    return ({"geometry": found[0]}, False) if len(found) == 1 else ({}, False)
+        partial = partial or pair
+    geometries = _best([_GEOMETRY], there)
+    return ({"geometry": geometries[0]} if len(geometries) == 1 else partial), False
 
 
 def _usual(name: str, there: Sequence[str], faults: list[str]) -> str | None:

@@ -57,7 +57,9 @@ def read_text_table(
         If the file is binary, not UTF-8 or a broken gzip, if rows differ in length, or if its columns cannot
         be told.
     """
-    first_line = _first_line(source)
+    first_line, n_blank, is_all = _first_line(source)
+    if header and is_all:
+        raise InputError("no rows below the header", where=source.path, fix="check the export")
     delimiter = delimiter or max(_DELIMITERS, key=first_line.count)
     cells = [cell.strip() for cell in next(csv.reader([first_line], delimiter=delimiter))]
     if header and all(map(_is_number, cells)):
@@ -70,7 +72,8 @@ def read_text_table(
     if repeated:
         raise InputError(f"several columns are called {', '.join(repeated)}", where=source.path, fix="rename them")
     types = {choice.columns[name]: _WORDS for name in ("trace_id", "vehicle_id", "kind") if name in choice.columns}
-    content = _parse(source, names, wanted, types, delimiter, header)
+    skip = n_blank + header
+    content = _parse(source, names, wanted, types, delimiter, skip)
     table, unit = {}, ""
     for name, theirs in choice.columns.items():
         values = _identifiers(content.column(theirs)) if name.endswith("_id") else content.column(theirs).to_pandas()
@@ -78,13 +81,13 @@ def read_text_table(
             values, unit = times_from_numbers(values)
         table[name] = standard_kinds(values) if name == "kind" else values
     guessed = tuple(f"{name}={choice.columns[name]}" for name in choice.guessed)
-    origin = TableOrigin("points" if points else "traces", "line", 2 if header else 1, choice.columns)
+    origin = TableOrigin("points" if points else "traces", "line", skip + 1, choice.columns)
     read = pd.DataFrame(table, copy=False)
     return RawTable(read, None, choice.degrees, origin, (*guessed, *([f"t in {unit}"] if unit else [])))
 
 
-def _first_line(source: SourceFile) -> str:
-    """Return the first line of a text file, or say why it is none."""
+def _first_line(source: SourceFile) -> tuple[str, int, bool]:
+    """Return the first line of a text file, the number of blank ones above, and whether nothing follows."""
     try:
         with gzip.open(source.path) if source.path.suffix.lower() == ".gz" else source.path.open("rb") as file:
             head = file.read(_HEAD)
@@ -96,14 +99,17 @@ def _first_line(source: SourceFile) -> str:
         raise InputError("the text is UTF-16", where=source.path, fix="save it as UTF-8")
     if b"\0" in head:
         raise InputError("the file is binary, not text", where=source.path, fix="check its suffix")
+    lines = head.splitlines()
+    n_blank = next(number for number, line in enumerate(lines) if line.strip())
     try:
-        return head.lstrip().splitlines()[0].decode("utf-8-sig")
+        first = lines[n_blank].decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"the first line is not UTF-8 ({error})", where=source.path, fix="save it as UTF-8") from error
+    return first, n_blank, len(head) < _HEAD and not any(line.strip() for line in lines[n_blank + 1 :])
 
 
 def _parse(
-    source: SourceFile, names: list[str], wanted: list[str], types: Mapping[str, Any], delimiter: str, header: bool
+    source: SourceFile, names: list[str], wanted: list[str], types: Mapping[str, Any], delimiter: str, skip: int
 ) -> pa.Table:
     """Parse the wanted columns, and report every row that is too short or too long."""
     ragged: list[Any] = []
@@ -118,18 +124,14 @@ def _parse(
     try:
         content = pyarrow.csv.read_csv(
             source.path,
-            read_options=pyarrow.csv.ReadOptions(use_threads=False, column_names=numbers, skip_rows=int(header)),
+            read_options=pyarrow.csv.ReadOptions(use_threads=False, column_names=numbers, skip_rows=skip),
             parse_options=pyarrow.csv.ParseOptions(delimiter=delimiter, invalid_row_handler=note),
             convert_options=pyarrow.csv.ConvertOptions(
                 include_columns=[number_of[name] for name in wanted],
                 column_types={number_of[name]: kind for name, kind in types.items()},
             ),
         )
-    except pa.ArrowInvalid as error:
-        if "Empty CSV file" in str(error):
-            raise InputError("no rows below the header", where=source.path, fix="check the export") from error
-        raise _broken(source, error) from error
-    except OSError as error:
+    except (pa.ArrowInvalid, OSError) as error:
         raise _broken(source, error) from error
     if ragged:
         shown = ", ".join(f"line {row.number}: {row.actual_columns}" for row in ragged[:_EXAMPLES_SHOWN])
