@@ -83,7 +83,8 @@ def find_crossings(network: RoadNetwork) -> Crossings:
     >>> from probe2road.simulate.network import network_from_sections
     >>> lines = [[(0, 0), (200, 0)], [(100, -90), (100, 90)]]
     >>> network = network_from_sections(lines, crs="EPSG:32616", layer=[0, 1])
-    >>> find_crossings(network).table[["upper", "lower", "x", "y", "rule"]].values.tolist()
+    >>> table = find_crossings(network).table
+    >>> table.loc[table["kind"] == "crossing", ["upper", "lower", "x", "y", "rule"]].values.tolist()
     [[1, 0, 100.0, 0.0, 'layer']]
     """
     lines = shapely.force_2d(network.sections.geometry.to_numpy())

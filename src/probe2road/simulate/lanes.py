@@ -1,13 +1,8 @@
 """Lanes in the plane of the road: where each one lies on its section, and how it meets the next section's.
 
-Strategy
---------
-Away from its ends a section carries its lanes side by side, symmetric about its line. At an end they may have to
-meet other lanes: where a motorway of three lanes continues with two, where a ramp leaves from the outer lane while
-both lines start at one node, where two carriageways become one road. There one section is the host and keeps its
-lanes; the others adapt: the borders of their lanes start at given lateral positions of the host and move to their
-own place along a taper. A border that finds no place on the host starts at the host's edge, so that a new lane opens
-from zero width. Borders, and with them lanes, are lateral offsets in metres, positive to the right of ``u`` to ``v``.
+Away from its ends a section carries its lanes side by side, symmetric about its line. At an end they take the place
+that `lane_ends` finds for them, and move from there to their own along a taper. Borders, and with them lanes, are
+lateral offsets in metres, positive to the right of ``u`` to ``v``.
 """
 
 from __future__ import annotations
@@ -16,11 +11,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from probe2road.simulate.lane_ends import adapted_ends
 from probe2road.simulate.network import RoadNetwork
 
-__all__ = ["lane_borders", "lane_offsets", "lateral_offset"]
+__all__ = ["LATERAL", "lane_borders", "lane_offsets", "lateral_offset"]
 
-_THROUGH = 60.0  # degrees; lanes connect where the heading changes by less than this
+# The columns that say where a lane or border lies along its section.
+LATERAL = ("offset", "start_offset", "end_offset", "start_taper", "end_taper")
+
 _TAPER_SECONDS = 2.5  # s; a lane moves to its place within this time at the speed limit
 _TAPER_LENGTHS = (20.0, 80.0)  # m; and within these bounds
 
@@ -99,7 +97,7 @@ def lane_borders(network: RoadNetwork) -> pd.DataFrame:
     table = pd.DataFrame({"section": sections.index.to_numpy()[row], "border": border, "offset": offset})
     length = sections.length.to_numpy()
     taper = np.minimum(np.clip(sections["speed_limit"].to_numpy() * _TAPER_SECONDS, *_TAPER_LENGTHS), length / 2.0)
-    adapted = _adapted_ends(network)
+    adapted = adapted_ends(network)
     for end in ("start", "end"):
         rule = adapted[adapted["end"] == end].drop_duplicates("section").set_index("section").reindex(table["section"])
         placed = rule["base"].to_numpy() + border * rule["step"].to_numpy()
@@ -137,7 +135,7 @@ def lateral_offset(table: pd.DataFrame, s: ArrayLike, length: ArrayLike) -> NDAr
     [0.0, 1.0, 2.0, 2.0]
     """
     s, length = np.asarray(s, float), np.asarray(length, float)
-    column = {name: table[name].to_numpy() for name in table if str(name).endswith(("offset", "taper"))}
+    column = {name: table[name].to_numpy() for name in LATERAL}
     start = (column["start_offset"] - column["offset"]) * _fade(s / np.maximum(column["start_taper"], 1e-9))
     end = (column["end_offset"] - column["offset"]) * _fade((length - s) / np.maximum(column["end_taper"], 1e-9))
     return np.asarray(column["offset"] + start + end)
@@ -147,86 +145,3 @@ def _fade(t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Smooth step from 1 at 0 to 0 at 1."""
     t = np.clip(t, 0.0, 1.0)
     return 1.0 - t * t * (3.0 - 2.0 * t)
-
-
-def _adapted_ends(network: RoadNetwork) -> pd.DataFrame:
-    """Find the ends of sections whose lanes take their places from another section.
-
-    Returns
-    -------
-    DataFrame
-        ``section``, ``end`` (start, end); border j lies at ``base + j * step`` there, clipped to ``[low, high]``.
-    """
-    moves = network.movements()
-    moves = moves[moves["turn"].abs() < _THROUGH]
-    lanes = _travel_lanes(network)
-    moves = moves.merge(lanes.add_prefix("from_"), on=["from_section", "from_direction"])
-    moves = moves.merge(lanes.add_prefix("to_"), on=["to_section", "to_direction"])
-    arrivals = moves.groupby(["to_section", "to_direction", "via_node"])["turn"].transform("size").to_numpy()
-    exits = moves.groupby(["from_section", "from_direction", "via_node"])["turn"].transform("size").to_numpy()
-    widens = (moves["to_count"] >= moves["from_count"]).to_numpy()
-    diverge = (arrivals == 1) & ((exits > 1) | widens) & moves["to_one_way"].to_numpy()
-    merge = (exits == 1) & ((arrivals > 1) | ((arrivals == 1) & ~widens)) & moves["from_one_way"].to_numpy()
-    outer = network.driving_side == "left"
-    leaving = _place(moves[diverge], host="from", guest="to", end="start", lone_right=outer)
-    joining = _place(moves[merge & ~diverge], host="to", guest="from", end="end", lone_right=outer)
-    return pd.concat([leaving, joining, _two_way_ends(moves, outer)], ignore_index=True)
-
-
-def _travel_lanes(network: RoadNetwork) -> pd.DataFrame:
-    """Count the lanes of each section in each driving direction, with their outer edges as seen in that direction."""
-    sections = network.sections
-    tables = []
-    for direction, own, other in ((1, "lanes_forward", "lanes_backward"), (-1, "lanes_backward", "lanes_forward")):
-        count, width = sections[own].to_numpy(), sections["lane_width"].to_numpy()
-        half = (count + sections[other].to_numpy()) / 2.0 * width
-        left = half - count * width if network.driving_side == "right" else -half
-        table = pd.DataFrame({"section": sections.index, "direction": direction, "count": count, "width": width})
-        one_way = (sections["lanes_backward"] == 0).to_numpy()
-        tables.append(table.assign(left=left, right=left + count * width, one_way=one_way)[count > 0])
-    return pd.concat(tables, ignore_index=True)
-
-
-def _place(moves: pd.DataFrame, *, host: str, guest: str, end: str, lone_right: bool) -> pd.DataFrame:
-    """Spread the guests of each host from its left to its right edge, in the order of their headings."""
-    key = [f"{host}_section", f"{host}_direction", "via_node"]
-    # A ramp that bends to the right leaves on the right; one that arrives bending to the right comes from the left.
-    order = moves["turn"] if end == "start" else -moves["turn"]
-    groups = moves.assign(order=order).groupby(key)["order"]
-    rank, size = groups.rank(method="first") - 1.0, groups.transform("size")
-    share = np.where(size > 1, rank / np.maximum(size - 1.0, 1.0), float(lone_right))
-    left, right, step = (moves[f"{host}_{name}"].to_numpy() for name in ("left", "right", "width"))
-    base = left + share * (right - left - moves[f"{guest}_count"].to_numpy() * step)
-    table = pd.DataFrame({"section": moves[f"{guest}_section"], "base": base, "step": step, "low": left, "high": right})
-    return table.assign(end=end)
-
-
-def _two_way_ends(moves: pd.DataFrame, left_hand: bool) -> pd.DataFrame:
-    """Align the centre lines of two two-way sections that continue each other with different lane counts."""
-    both = moves[~moves["from_one_way"] & ~moves["to_one_way"]]
-    pair = ["from_section", "to_section", "via_node"]
-    alone = both.groupby(["from_section", "from_direction", "via_node"])["turn"].transform("size") == 1
-    both = both[alone & (both.groupby(["to_section", "to_direction", "via_node"])["turn"].transform("size") == 1)]
-    back = both.rename(columns={"from_section": "to_section", "to_section": "from_section"})
-    back = back.rename(columns={"from_count": "to_back_count", "to_count": "from_back_count"})
-    both = both.merge(back[[*pair, "from_back_count", "to_back_count"]], on=pair)
-    host_lanes = both["from_count"] + both["from_back_count"]
-    guest_lanes = both["to_count"] + both["to_back_count"]
-    both = both[(guest_lanes > host_lanes) & (both["from_section"] != both["to_section"])]
-    # In the frame of travel from host to guest; the guest's own frame is the same where it is drawn that way.
-    low = both["from_left"] if left_hand else both["from_right"] - host_lanes * both["from_width"]
-    high = low + host_lanes * both["from_width"]
-    centre = both["from_right"] if left_hand else both["from_left"]
-    base = centre - (both["to_count"] if left_hand else both["to_back_count"]) * both["from_width"]
-    top = base + guest_lanes * both["from_width"]
-    drawn = both["to_direction"].to_numpy() == 1
-    return pd.DataFrame(
-        {
-            "section": both["to_section"],
-            "end": np.where(drawn, "start", "end"),
-            "base": np.where(drawn, base, -top),
-            "step": both["from_width"],
-            "low": np.where(drawn, low, -high),
-            "high": np.where(drawn, high, -low),
-        }
-    )

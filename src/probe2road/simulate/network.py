@@ -99,13 +99,14 @@ class MarkingStyle:
     dash_slow: float  # m, on all other roads
     gap_slow: float  # m
     edge_inset: float = 0.25  # m, from the outer border of the outermost lane inwards to its edge line
+    solid_centre: bool = False  # the directions of a two-lane road are divided by a solid line rather than by dashes
     shoulder: float = 2.5  # m, from the border of the lanes to a guard rail or barrier on motorways and trunk roads
     kerb: float = 0.5  # m, from the border of the lanes to a kerb on all other roads
 
 
 MARKING_STYLES: Mapping[str, MarkingStyle] = {
     # MUTCD 2009 section 3A.06: 10 ft lines, 30 ft gaps
-    "US": MarkingStyle("US", 3.05, 9.14, 3.05, 9.14, shoulder=3.0),
+    "US": MarkingStyle("US", 3.05, 9.14, 3.05, 9.14, solid_centre=True, shoulder=3.0),
     # RMS-1 1993: 6 m / 12 m on motorways, 3 m / 6 m in towns
     "DE": MarkingStyle("DE", 6.0, 12.0, 3.0, 6.0),
     # Regolamento di esecuzione (DPR 495/1992) art. 138: type a 4.5 m / 7.5 m, type b 3 m / 4.5 m
