@@ -1,0 +1,244 @@
+"""What crosses the border between a road graph and a file, whatever the format.
+
+Going out, tables are checked for what must not leave (ids of vehicles and traces, times) and brought into
+plain column types. Coming in, a graph is put together from a table of edges that carries our columns. Formats
+that hold a single table keep the turns in a text column of the edges, and get their nodes back from the ends
+of the edges.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from probe2road.errors import InputError, OutputError
+from probe2road.roadgraph import (
+    EDGE_DTYPES,
+    TURN_DTYPES,
+    RoadGraph,
+    check_graph,
+    empty_turns,
+    finish_edges,
+    move_ends,
+    without_unknown_heights,
+)
+
+__all__ = [
+    "OWN_COLUMNS",
+    "crs_to_text",
+    "edges_with_turns",
+    "graph_from_edge_table",
+    "outgoing",
+    "text_value",
+    "typed_column",
+]
+
+OWN_COLUMNS = ("edge", "u", "v", "key", "origin")  # a table with these was written by us
+TURNS_COLUMN = "turns"
+
+_PRIVATE_NAME = re.compile(
+    r"((trace|vehicle|drive|driver|trip|device|user)s?[_-]?(id|ids|uuid)?|vin|t|(first|last)?_?(seen|time|timestamp|date|datetime))s?",
+    re.IGNORECASE,
+)
+
+_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f]")
+
+
+def outgoing(graph: RoadGraph, *, where: object) -> RoadGraph:
+    """Return the graph as it may leave: without private columns, in plain types, edges in order of id.
+
+    Raises
+    ------
+    OutputError
+        If a column holds, by its name or type, ids of vehicles or traces, or times; or if its values are
+        not plain numbers, text or flags. Dropping it silently would hide that private data came this far.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(0, 0), (9, 0)]], crs="EPSG:32616")
+    >>> outgoing(replace(graph, edges=graph.edges.assign(vehicle_id="A7")), where="roads.gpkg")
+    Traceback (most recent call last):
+        ...
+    probe2road.errors.OutputError: roads.gpkg: column 'vehicle_id' of the edges may identify drives; drop it ...
+    """
+    for name, table in (("nodes", graph.nodes), ("edges", graph.edges), ("turns", graph.turns)):
+        for column in table.columns.drop("geometry", errors="ignore"):
+            _refuse_private(table[column], name, where)
+    nodes, edges, turns = graph.nodes.sort_index(), graph.edges.sort_index(), graph.turns.reset_index(drop=True)
+    edges = edges.set_geometry(_uniform_dimension(edges.geometry.to_numpy()), crs=edges.crs)
+    for table in (nodes, edges, turns):
+        table.attrs = {}  # pandas writes them into Parquet
+    return RoadGraph(nodes, edges, turns)
+
+
+def _refuse_private(values: pd.Series, table: str, where: object) -> None:
+    """Refuse a column that may identify drives, or that no format can hold."""
+    is_time = pd.api.types.is_datetime64_any_dtype(values.dtype) or pd.api.types.is_timedelta64_dtype(values.dtype)
+    if is_time or _PRIVATE_NAME.fullmatch(str(values.name)):
+        raise OutputError(
+            f"column {values.name!r} of the {table} may identify drives",
+            where=where,
+            fix="drop it before writing; ids of vehicles and traces, and times, never leave with a graph",
+        )
+    if (
+        values.dtype == object
+        and not values.map(lambda value: value is None or np.isscalar(value) or value is pd.NA).all()
+    ):
+        raise OutputError(
+            f"column {values.name!r} of the {table} holds values that are not numbers or text",
+            where=where,
+            fix="drop it before writing, or turn it into text",
+        )
+
+
+def _uniform_dimension(lines: NDArray[Any]) -> NDArray[Any]:
+    """Give all lines a height where one has: NaN where unknown, which a layer with heights can hold."""
+    if not shapely.has_z(lines).any():
+        return lines
+    coordinates, owner = shapely.get_coordinates(lines, include_z=True, return_index=True)
+    return shapely.linestrings(coordinates, indices=owner)
+
+
+def edges_with_turns(graph: RoadGraph) -> gpd.GeoDataFrame:
+    """Return the edges with their id as a column and their turns as text ``to_edge@via_node:count``.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(0, 0), (9, 0)], [(9, 0), (9, 9)]], crs="EPSG:32616")
+    >>> turns = pd.DataFrame({"from_edge": [0, 0], "via_node": [1, 1], "to_edge": [1, 0], "count": [5, 2]})
+    >>> edges_with_turns(replace(graph, turns=turns))["turns"].tolist()
+    ['1@1:5 0@1:2', nan]
+    """
+    edges = graph.edges.reset_index()
+    if graph.turns.empty:
+        return edges
+    text = [f"{to}@{via}:{count}" for to, via, count in graph.turns[["to_edge", "via_node", "count"]].to_numpy()]
+    of_edge = pd.Series(text, dtype="str").groupby(graph.turns["from_edge"].to_numpy()).agg(" ".join)
+    return edges.assign(**{TURNS_COLUMN: edges["edge"].map(of_edge).astype("str")})
+
+
+def _turns_from_text(edges: pd.DataFrame) -> pd.DataFrame:
+    """Undo `edges_with_turns`, in the order of the edges."""
+    if TURNS_COLUMN not in edges:
+        return empty_turns()
+    text = edges.set_index("edge")[TURNS_COLUMN].dropna().str.split().explode().dropna()
+    parts = text.str.extract(r"^(?P<to_edge>-?\d+)@(?P<via_node>-?\d+):(?P<count>\d+)$")
+    return parts.rename_axis("from_edge").reset_index()[list(TURN_DTYPES)].astype(TURN_DTYPES)
+
+
+def graph_from_edge_table(
+    table: gpd.GeoDataFrame,
+    *,
+    nodes: gpd.GeoDataFrame | None = None,
+    turns: pd.DataFrame | None = None,
+    where: object,
+) -> RoadGraph:
+    """Put a graph together from edges that carry `OWN_COLUMNS`, in a metric CRS.
+
+    Parameters
+    ----------
+    table
+        One row per edge, ``edge`` a column; lines whose heights are all NaN lose them.
+    nodes
+        Nodes with ``node`` as a column, or None: then they are the ends of the edges.
+    turns
+        Turn table, or None: then it is read from the text column of the edges.
+    where
+        The file, for error messages.
+
+    Raises
+    ------
+    InputError
+        If a column cannot be converted, or the graph breaks an invariant.
+    """
+    try:
+        turns = _turns_from_text(table) if turns is None else turns[list(TURN_DTYPES)].astype(TURN_DTYPES)
+        edges = (
+            table.drop(columns=TURNS_COLUMN, errors="ignore").astype({"edge": "int64"}).set_index("edge").sort_index()
+        )
+        key = edges["key"].astype("int64")
+        edges = edges.set_geometry(without_unknown_heights(edges.geometry.to_numpy()), crs=table.crs)
+        text = [name for name in edges if name not in EDGE_DTYPES and pd.api.types.is_object_dtype(edges[name].dtype)]
+        edges = finish_edges(edges.astype(dict.fromkeys(text, "str"))).assign(key=key)
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(
+            f"the columns of the edges are damaged ({error})", where=where, fix="write it again"
+        ) from error
+    if nodes is None:
+        nodes, edges = _nodes_from_ends(edges)
+    else:
+        nodes = nodes.astype({"node": "int64"}).set_index("node").sort_index()
+    graph = RoadGraph(nodes, edges, turns)
+    check_graph(graph, where=where)
+    return graph
+
+
+def _nodes_from_ends(edges: gpd.GeoDataFrame) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
+    """Place every node at the first edge end that names it, and move the other ends there.
+
+    A format that rounds coordinates can part ends that were within a millimetre of each other.
+    """
+    lines = edges.geometry.to_numpy()
+    ends = shapely.get_point(np.tile(lines, 2), np.repeat([0, -1], len(lines)))
+    node = edges[["u", "v"]].to_numpy().T.ravel()
+    ids, first, place = np.unique(node, return_index=True, return_inverse=True)
+    position = shapely.get_coordinates(ends)
+    nodes = gpd.GeoDataFrame(
+        geometry=shapely.points(position[first]), index=pd.Index(ids, name="node", dtype="int64"), crs=edges.crs
+    )
+    apart = np.hypot(*(position - position[first][place]).T)
+    if apart.any():
+        u, v = position[first][place].reshape(2, -1, 2)
+        edges = edges.set_geometry(move_ends(lines, u, v), crs=edges.crs)
+        edges["length"] = edges.length
+    return nodes, edges
+
+
+def text_value(value: Any) -> str | None:
+    """Return a value as text for a format that knows only text; None where it is missing.
+
+    Control characters, which XML cannot hold, are left out.
+
+    Examples
+    --------
+    >>> text_value(0.1), text_value(7), text_value(pd.NA)
+    ('0.1', '7', None)
+    """
+    if pd.isna(value):
+        return None
+    return _CONTROL.sub("", repr(float(value)) if isinstance(value, float) else str(value))
+
+
+def typed_column(text: pd.Series) -> pd.Series:
+    """Undo `text_value` on a column: numbers or flags where every value reads as one, else text."""
+    if text.dropna().isin(["True", "False"]).all():
+        return text.map({"True": True, "False": False})
+    try:
+        return pd.to_numeric(text)
+    except (ValueError, TypeError):
+        return text
+
+
+def crs_to_text(crs: CRS) -> str:
+    """Return the shortest text that `probe2road.crs.parse_crs` turns into an equal CRS.
+
+    Examples
+    --------
+    >>> crs_to_text(CRS.from_epsg(32616))
+    'EPSG:32616'
+    """
+    authority = crs.to_authority()
+    if authority is not None and CRS.from_authority(*authority) == crs:
+        return ":".join(authority)
+    return crs.to_json()

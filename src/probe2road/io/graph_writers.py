@@ -1,0 +1,189 @@
+"""A road graph to GIS files: GeoPackage, GeoParquet, FlatGeobuf and GeoJSON.
+
+=============  ============================================  ===================  =========
+format         tables                                        coordinates          precision
+=============  ============================================  ===================  =========
+GeoPackage     layers ``nodes``, ``edges``, table ``turns``  metric CRS           exact
+GeoParquet     ``NAME.parquet`` holds the edges; the others  metric CRS           exact
+               lie beside it as ``NAME.nodes.parquet`` and
+               ``NAME.turns.parquet``
+FlatGeobuf     edges, turns as text                          metric CRS           exact
+GeoJSON        edges, turns as text                          degrees (RFC 7946),  1 mm
+                                                             metric CRS recorded
+=============  ============================================  ===================  =========
+
+With turns as text, an edge carries ``to_edge@via_node:count`` for every turn that starts on it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import pyogrio
+import shapely
+
+from probe2road.crs import WGS84, transform
+from probe2road.io.atomic import atomic_path
+from probe2road.io.graph_tables import crs_to_text, edges_with_turns, outgoing
+from probe2road.roadgraph import RoadGraph
+
+__all__ = [
+    "geojson_features",
+    "parquet_siblings",
+    "write_flatgeobuf",
+    "write_geojson",
+    "write_geopackage",
+    "write_geoparquet",
+]
+
+logger = logging.getLogger(__name__)
+
+GEOJSON_DECIMALS = 8  # of a degree: 1 mm
+
+
+def write_geopackage(graph: RoadGraph, path: str | PathLike[str]) -> None:
+    """Write the layers ``nodes`` and ``edges`` and the attribute table ``turns`` to a GeoPackage.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written or the graph holds private columns.
+    """
+    graph = outgoing(graph, where=path)
+    with atomic_path(path) as temporary:
+        # Edges first: a program that opens only one layer opens the first.
+        layers = {"edges": graph.edges.reset_index(), "nodes": graph.nodes.reset_index(), "turns": graph.turns}
+        for layer, table in layers.items():
+            pyogrio.write_dataframe(
+                table,
+                temporary,
+                layer=layer,
+                driver="GPKG",
+                append=layer != "edges",
+                geometry_type={"edges": _line_type(graph), "nodes": _point_type(graph)}.get(layer),
+            )
+
+
+def write_geoparquet(graph: RoadGraph, path: str | PathLike[str]) -> None:
+    """Write the edges as GeoParquet 1.1 with a covering bounding box, nodes and turns in files beside it.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written or the graph holds private columns.
+    """
+    graph = outgoing(graph, where=path)
+    nodes_path, turns_path = parquet_siblings(path)
+    # The edges come last: where they are new, so is everything beside them.
+    with atomic_path(turns_path) as temporary:
+        graph.turns.to_parquet(temporary, index=False, compression="zstd")
+    for table, target in ((graph.nodes, nodes_path), (graph.edges, path)):
+        with atomic_path(target) as temporary:
+            table.reset_index().to_parquet(
+                temporary, index=False, compression="zstd", schema_version="1.1.0", write_covering_bbox=True
+            )
+
+
+def parquet_siblings(path: str | PathLike[str]) -> tuple[Path, Path]:
+    """Return where the nodes and the turns of a GeoParquet graph lie.
+
+    Examples
+    --------
+    >>> [sibling.name for sibling in parquet_siblings("roads.parquet")]
+    ['roads.nodes.parquet', 'roads.turns.parquet']
+    """
+    path = Path(path)
+    return path.with_name(f"{path.stem}.nodes{path.suffix}"), path.with_name(f"{path.stem}.turns{path.suffix}")
+
+
+def write_flatgeobuf(graph: RoadGraph, path: str | PathLike[str]) -> None:
+    """Write the edges, with a spatial index and their turns as text, to a FlatGeobuf file.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written or the graph holds private columns.
+    """
+    graph = outgoing(graph, where=path)
+    with atomic_path(path) as temporary:
+        pyogrio.write_dataframe(
+            edges_with_turns(graph), temporary, layer="edges", driver="FlatGeobuf", geometry_type=_line_type(graph)
+        )
+
+
+def write_geojson(graph: RoadGraph, path: str | PathLike[str]) -> None:
+    """Write the edges, with their turns as text, to GeoJSON in longitude and latitude (RFC 7946).
+
+    The first line is a foreign member ``probe2road`` that names the metric CRS to read the graph back into.
+    Heights are written for the lines whose every height is known.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written or the graph holds private columns.
+    """
+    graph = outgoing(graph, where=path)
+    features = geojson_features(edges_with_turns(graph), decimals=GEOJSON_DECIMALS)
+    head = json.dumps({"type": "FeatureCollection", "probe2road": {"crs": crs_to_text(graph.crs)}})
+    rows = ",\n".join(json.dumps(feature, separators=(",", ":"), allow_nan=False) for feature in features)
+    with atomic_path(path) as temporary:
+        temporary.write_text(f'{head[:-1]},\n"features": [\n{rows}\n]}}\n', encoding="utf-8")
+
+
+def geojson_features(table: gpd.GeoDataFrame, *, decimals: int) -> list[dict[str, Any]]:
+    """Return the GeoJSON features of a table of LineStrings in a metric CRS; missing values become null.
+
+    Parameters
+    ----------
+    table
+        One row per feature.
+    decimals
+        Digits behind the point, in degrees; heights have three.
+
+    Examples
+    --------
+    >>> line = shapely.LineString([(500000, 0), (500000, 100)])
+    >>> geojson_features(gpd.GeoDataFrame({"edge": [7]}, geometry=[line], crs="EPSG:32632"), decimals=6)[0]["geometry"]
+    {'type': 'LineString', 'coordinates': [[9.0, 0.0], [9.0, 0.000905]]}
+    """
+    lines = table.geometry.to_numpy()
+    coordinates, owner = shapely.get_coordinates(lines, include_z=True, return_index=True)
+    lon, lat = transform(coordinates[:, 0], coordinates[:, 1], table.crs, WGS84)
+    in_plan = np.zeros(len(lines), bool)
+    in_plan[owner[~np.isfinite(coordinates[:, 2])]] = True
+    positions = np.column_stack(
+        [np.round(lon, decimals), np.round(lat, decimals), np.round(coordinates[:, 2], 3)]
+    ).tolist()
+    starts = np.searchsorted(owner, np.arange(len(lines) + 1)).tolist()
+    features = []
+    for row, properties in enumerate(_plain_records(table.drop(columns=table.geometry.name))):
+        vertices = positions[starts[row] : starts[row + 1]]
+        if in_plan[row]:
+            vertices = [vertex[:2] for vertex in vertices]
+        geometry = {"type": "LineString", "coordinates": vertices}
+        features.append({"type": "Feature", "properties": properties, "geometry": geometry})
+    return features
+
+
+def _plain_records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return rows as dictionaries of Python values, None where a value is missing or infinite."""
+    plain = table.astype(object).where(table.notna() & ~table.isin([np.inf, -np.inf]), None)
+    columns = [plain[column].tolist() for column in plain]
+    names = [str(column) for column in plain]
+    return [dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)]
+
+
+def _line_type(graph: RoadGraph) -> str:
+    """Name the layer's geometry type: a layer with heights says so."""
+    return "LineString Z" if shapely.has_z(graph.edges.geometry.to_numpy()).any() else "LineString"
+
+
+def _point_type(graph: RoadGraph) -> str:
+    return "Point Z" if shapely.has_z(graph.nodes.geometry.to_numpy()).any() else "Point"
