@@ -223,38 +223,59 @@ def _checked(
 
 
 def _identifiers(ids: pd.Series, origin: TableOrigin, faults: list[str]) -> Any:
-    """Check trace ids for holes and bring mixed types to text, so that they sort."""
-    holes = int(ids.isna().sum())
-    if holes:
-        faults.append(f"{origin.name}: column {origin.column('trace_id')} is empty in {holes} of {len(ids)} rows")
-    if isinstance(ids.dtype, pd.CategoricalDtype):
-        ids = ids.astype(ids.cat.categories.dtype) if not holes else ids
-    return ids.astype(str).array if pd.api.types.is_object_dtype(ids.dtype) else ids.array
+    """Check trace ids for holes, and bring mixed types and bytes to text, so that they sort."""
+    name = f"{origin.name}: column {origin.column('trace_id')}"
+    empty = ids.isna().to_numpy()
+    if pd.api.types.is_string_dtype(ids.dtype) and not pd.api.types.is_object_dtype(ids.dtype):
+        empty = empty | (ids == "").to_numpy(bool, na_value=False)
+    if empty.any():
+        faults.append(f"{name} is empty in {int(empty.sum())} of {len(ids)} rows")
+    if isinstance(ids.dtype, pd.CategoricalDtype) and not empty.any():
+        ids = ids.astype(ids.cat.categories.dtype)
+    if not pd.api.types.is_object_dtype(ids.dtype):
+        return ids.array
+    try:
+        codes, found = pd.factorize(ids)
+    except TypeError:  # lists and the like
+        faults.append(f"{name} holds neither text nor numbers")
+        return ids.array
+    words = [value.hex() if isinstance(value, bytes) else str(value) for value in found]
+    return pd.array([*words, None], dtype="str").take(codes)
 
 
 def _numbers(values: pd.Series, origin: TableOrigin, faults: list[str], *, must_be_finite: bool) -> NDArray[np.float64]:
     """Convert a column to float64, or name the cells that prevent it."""
     name = f"{origin.name}: column {origin.column(str(values.name))}"
-    if pd.api.types.is_numeric_dtype(values.dtype):
+    if _is_plain_numeric(values):
         numbers = values.to_numpy(dtype=np.float64, na_value=np.nan)
+    elif values.dtype.kind in "bmM":
+        faults.append(f"{name} holds {values.dtype}, not numbers")
+        return np.full(len(values), np.nan)
     else:
-        numbers = pd.to_numeric(values, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
-        filled = values.notna().to_numpy() & (values.astype(str).str.strip() != "").to_numpy(bool)
-        not_numeric = np.isnan(numbers) & filled & (values.astype(str).str.lower() != "nan").to_numpy(bool)
+        words = values.astype(object).map(str, na_action="ignore").str.strip()
+        numbers = pd.to_numeric(words, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
+        not_numeric = np.isnan(numbers) & ~(words.isna() | words.str.lower().isin(["", "nan"])).to_numpy(bool)
         if not_numeric.any():
-            comma = values[not_numeric].astype(str).str.fullmatch(r"[+-]?\d+,\d+").all()
+            comma = words[not_numeric].str.fullmatch(r"[+-]?\d+,\d+").all()
             hint = "; decimal commas are not read, use points" if comma else ""
-            faults.append(f"{name} is not a number in {origin.rows(not_numeric, values)}{hint}")
+            faults.append(f"{name} is not a number in {origin.rows(not_numeric, words)}{hint}")
             return numbers
     if must_be_finite and not np.isfinite(numbers).all():
         faults.append(f"{name} is empty or not finite in {origin.rows(~np.isfinite(numbers), numbers)}")
     return numbers
 
 
+def _is_plain_numeric(values: pd.Series) -> bool:
+    return bool(pd.api.types.is_numeric_dtype(values.dtype) and values.dtype.kind != "b")
+
+
 def _timestamps(values: pd.Series, origin: TableOrigin, faults: list[str]) -> pd.Series:
     """Convert a column to UTC timestamps: numbers are seconds since 1970, text is ISO 8601, naive is UTC."""
     name = f"{origin.name}: column {origin.column('t')}"
-    if pd.api.types.is_numeric_dtype(values.dtype):
+    if values.dtype.kind in "bm":
+        faults.append(f"{name} holds {values.dtype}, not times")
+        return _no_times(len(values))
+    if _is_plain_numeric(values):
         seconds = values.to_numpy(dtype=np.float64, na_value=np.nan)
         largest = float(np.nanmax(np.abs(seconds), initial=0.0))
         if not largest < 9.2e9:

@@ -8,6 +8,8 @@ from pathlib import Path
 import geopandas as gpd
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import shapely
 
@@ -167,3 +169,34 @@ def test_semantic_points_that_are_wrong(tmp_path: Path) -> None:
 def test_a_given_column_that_is_not_there(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(GOOD)
     assert "there is no column 'drive' (trace_id)" in refusal(tmp_path / "a.csv", columns={"trace_id": "drive"})
+
+
+ODD_COLUMNS = {
+    "list": pa.array([[1.0], [2.0]]),
+    "bool": pa.array([True, False]),
+    "timestamp": pa.array([0, 10**9], pa.timestamp("ns")),
+    "duration": pa.array([0, 10**9], pa.duration("ns")),
+    "struct": pa.array([{"a": 1}, {"a": 2}]),
+    "missing": pa.nulls(2),
+    "bytes": pa.array([b"\xff", b"b"]),
+    "text": pa.array(["a", ""]),
+    "words": pa.array(["a", "b"]).dictionary_encode(),
+}
+
+
+@pytest.mark.parametrize("kind", ODD_COLUMNS)
+@pytest.mark.parametrize("column", ["t", "x", "y", "speed"])
+def test_columns_of_odd_types(tmp_path: Path, column: str, kind: str) -> None:
+    good = {"trip": [1, 1], "t": [0, 1], "x": [446e3, 446009.0], "y": [4636e3, 4636e3], "speed": [1.0, 2.0]}
+    pq.write_table(pa.table({**good, column: ODD_COLUMNS[kind]}), tmp_path / "a.parquet")
+    if (column, kind) in {("t", "timestamp"), ("t", "missing"), ("speed", "missing")}:
+        assert len(read_fleet(tmp_path / "a.parquet", crs=UTM).traces) == 2
+    else:
+        assert f"column '{column}' " in refusal(tmp_path / "a.parquet")
+
+
+@pytest.mark.parametrize("kind", ["list", "struct", "missing", "text"])
+def test_ids_of_odd_types(tmp_path: Path, kind: str) -> None:
+    table = {"trip": ODD_COLUMNS[kind], "x": [446e3, 446009.0], "y": [4636e3, 4636e3]}
+    pq.write_table(pa.table(table), tmp_path / "a.parquet")
+    assert "column 'trip' (trace_id)" in refusal(tmp_path / "a.parquet")

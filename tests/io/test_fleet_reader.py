@@ -180,6 +180,21 @@ def test_semantic_points(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(again.points, fleet.points)
 
 
+def test_a_bbox_without_semantic_points(tmp_path: Path) -> None:
+    METRES.to_csv(tmp_path / "drives.csv", index=False)
+    METRES.assign(kind="lane_marking", y=4637000.0).to_csv(tmp_path / "points.csv", index=False)
+    box = (445000.0, 4635000.0, 447000.0, 4636100.0)
+    fleet = read_fleet(tmp_path / "drives.csv", tmp_path / "points.csv", crs=UTM, bbox=box)
+    assert (len(fleet.traces), len(fleet.points)) == (3, 0)
+
+
+def test_ids_in_bytes_and_decimals(tmp_path: Path) -> None:
+    for ids in (pa.array([b"\x01\xff"] * 5, pa.binary(2)), pa.array([7] * 5, pa.decimal128(20, 0))):
+        table = pa.Table.from_pandas(METRES.assign(t=METRES["t"] + pd.to_timedelta([0, 0, 0, 1, 1], unit="h")))
+        pq.write_table(table.set_column(0, "trip", ids), tmp_path / "drives.parquet")
+        assert read_fleet(tmp_path / "drives.parquet", crs=UTM).n_traces == 1
+
+
 def test_points_may_be_in_another_crs_that_their_file_states(tmp_path: Path) -> None:
     degrees().to_csv(tmp_path / "drives.csv", index=False)
     geo(kind="lane_marking").to_parquet(tmp_path / "points.parquet")

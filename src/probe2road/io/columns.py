@@ -173,8 +173,8 @@ def times_from_numbers(values: pd.Series) -> tuple[pd.Series, str]:
     Returns
     -------
     (Series, str)
-        UTC times (NaT where the number is missing) and the unit found. Values that are not finite or too
-        large for a time come back as they were, in seconds, for the validator to refuse.
+        UTC times (NaT where the number is missing) and the unit found. A column of anything but numbers comes
+        back as it is, without unit; numbers too large for a time come back in seconds, to be refused later.
 
     Examples
     --------
@@ -182,6 +182,8 @@ def times_from_numbers(values: pd.Series) -> tuple[pd.Series, str]:
     >>> unit, str(times[1])
     ('ms', '2020-01-01 00:00:00.200000+00:00')
     """
+    if pd.api.types.is_bool_dtype(values.dtype) or not pd.api.types.is_numeric_dtype(values.dtype):
+        return values, ""
     numbers = values.to_numpy(dtype=np.float64, na_value=np.nan)
     middle = float(np.nanmedian(np.abs(numbers))) if np.isfinite(numbers).any() else 0.0
     unit = "s" if middle < 1e11 else "ms" if middle < 1e14 else "us" if middle < 1e17 else "ns"

@@ -77,7 +77,7 @@ def read_text_table(
     table, unit = {}, ""
     for name, theirs in choice.columns.items():
         values = _identifiers(content.column(theirs)) if name.endswith("_id") else content.column(theirs).to_pandas()
-        if name == "t" and pd.api.types.is_numeric_dtype(values.dtype):
+        if name == "t":
             values, unit = times_from_numbers(values)
         table[name] = standard_kinds(values) if name == "kind" else values
     guessed = tuple(f"{name}={choice.columns[name]}" for name in choice.guessed)

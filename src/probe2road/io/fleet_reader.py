@@ -68,8 +68,8 @@ def read_fleet(
     target_crs
         Metric CRS to work in; see `probe2road.fleet.fleet_from_tables`.
     bbox
-        ``(left, bottom, right, top)`` in the CRS of the files: only fixes and points inside are read. In
-        Parquet, row groups outside are skipped.
+        ``(left, bottom, right, top)`` in the CRS of the files (degrees for longitude and latitude): only fixes
+        and points inside are read. In Parquet, row groups outside are skipped.
     delimiter
         Of text tables; told from the first line where it is None.
     header
@@ -109,6 +109,9 @@ def read_fleet(
     if points is not None:
         point_table, point_crs, _ = _read_all(points, point_columns or {}, options, points=True)
     where = _name(traces)
+    if trace_table is None:
+        fix = f"bbox is (left, bottom, right, top) in the CRS of the data, {trace_crs.name}"
+        raise InputError(f"no fixes inside bbox {bbox}", where=where, fix=fix)
     fleet = fleet_from_checked(
         trace_table, point_table, crs=trace_crs, points_crs=point_crs, target_crs=target_crs, where=where
     )
@@ -139,8 +142,8 @@ def _checked_bbox(bbox: Sequence[float]) -> BBox:
 
 def _read_all(
     source: Source, columns: Mapping[str, Any], options: _Options, *, points: bool
-) -> tuple[pd.DataFrame, CRS, str]:
-    """Read and check all files of one kind of table; the table, its CRS, and what was guessed."""
+) -> tuple[pd.DataFrame | None, CRS, str]:
+    """Read and check all files of one kind of table; the table (None if empty), its CRS, what was guessed."""
     files, left_out = find_sources(source, semantic_points=points)
     if left_out:
         logger.warning("left out %d files of semantic points; pass them as points", len(left_out))
@@ -163,14 +166,8 @@ def _read_all(
     if errors:
         raise _joined(errors, len(files))
     crs = _one_crs(crs_of)
-    if not tables:
-        raise InputError(
-            f"no {'points' if points else 'fixes'} inside bbox {options.bbox}",
-            where=_name(source),
-            fix=f"bbox is (left, bottom, right, top) in the CRS of the data, {crs.name}",
-        )
     told = f"found by name: {', '.join(guesses)}; CRS {crs.name}" if guesses else f"CRS {crs.name}"
-    return _concatenated(tables), crs, told
+    return _concatenated(tables) if tables else None, crs, told
 
 
 def _read_one(file: SourceFile, columns: Mapping[str, Any], options: _Options, *, points: bool) -> RawTable:

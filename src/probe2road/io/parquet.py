@@ -135,8 +135,10 @@ def _our_columns(content: pa.Table, choice: ColumnChoice, source: SourceFile) ->
         if name == "geometry":
             table |= point_coordinates(column, name=theirs, where=source.path)
             continue
+        if pa.types.is_decimal(column.type) and not name.endswith("_id"):
+            column = column.cast(pa.float64())
         values = column.to_pandas()
-        if name == "t" and pd.api.types.is_numeric_dtype(values.dtype):
+        if name == "t":
             values, unit = times_from_numbers(values)
         table[name] = standard_kinds(values) if name == "kind" else values.reset_index(drop=True)
     return pd.DataFrame(table, copy=False), unit
