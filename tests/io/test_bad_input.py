@@ -56,6 +56,7 @@ def refusal(*source: Path, crs: str | None = UTM, **options: object) -> str:
         ("a.csv", b"\x00\x01\x02PAR1" * 50, "the file is binary, not text"),
         ("a.csv", b"trip,x,x,y\n1,1,1,1\n", "several columns are called x"),
         ("a.csv.gz", gzip.compress(GOOD.encode() * 50)[:-20], "broken gzip"),
+        ("a.csv.gz", gzip.compress(GOOD.encode())[:20] + b"\xff" * 40, "broken gzip"),
         ("a.csv.gz", GOOD.encode(), "broken gzip"),
         ("a.parquet", GOOD.encode(), "not a readable Parquet file"),
         ("a.gpx", GOOD.encode(), "broken XML at line 1"),

@@ -233,6 +233,13 @@ def test_a_bbox_that_is_no_box_is_refused(tmp_path: Path, bbox: tuple[float, ...
         read_fleet(tmp_path, bbox=bbox)  # type: ignore[arg-type]
 
 
+def test_a_delimiter_is_one_character(tmp_path: Path) -> None:
+    METRES.to_csv(tmp_path / "drives.txt", index=False, sep="^")
+    assert_expected(read_fleet(tmp_path / "drives.txt", crs=UTM, delimiter="^"))
+    with pytest.raises(OptionError, match="is not one character"):
+        read_fleet(tmp_path / "drives.txt", crs=UTM, delimiter="^^")
+
+
 def test_the_byte_order_mark_blanks_and_quotes_of_spreadsheets(tmp_path: Path) -> None:
     text = '\ufeff"trip" , "t" , "x" , "y"\r\n"7",0,446000,4636000\r\n"7",1, 446009.0 ,4636000\r\n'
     (tmp_path / "drives.csv").write_bytes(text.replace('" , "', '","').encode())

@@ -89,10 +89,12 @@ def test_broken_files_are_refused(tmp_path: Path, text: str, message: str) -> No
     assert message in str(caught.value)
 
 
-def test_a_truncated_gzip_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.gpx.gz").write_bytes(gzip.compress(UNTIMED.encode())[:-12])
-    with pytest.raises(InputError, match="broken gzip"):
-        read_fleet(tmp_path)
+def test_a_truncated_or_damaged_gzip_is_refused(tmp_path: Path) -> None:
+    whole = gzip.compress(UNTIMED.encode())
+    for content in (whole[:-12], whole[:30] + b"\xff" * 20 + whole[50:], UNTIMED.encode()):
+        (tmp_path / "a.gpx.gz").write_bytes(content)
+        with pytest.raises(InputError, match="broken gzip"):
+            read_fleet(tmp_path)
 
 
 def test_crs_other_than_wgs84_contradicts_gpx(tmp_path: Path) -> None:

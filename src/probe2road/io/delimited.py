@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import gzip
 import re
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -91,7 +92,7 @@ def _first_line(source: SourceFile) -> tuple[str, int, bool]:
     try:
         with gzip.open(source.path) if source.path.suffix.lower() == ".gz" else source.path.open("rb") as file:
             head = file.read(_HEAD)
-    except (OSError, EOFError) as error:
+    except (OSError, EOFError, zlib.error) as error:
         raise _broken(source, error) from error
     if not head.strip():
         raise InputError("the file holds no text", where=source.path, fix="write it again")

@@ -88,7 +88,7 @@ def read_fleet(
     CRSError
         If there is no CRS, if ``crs`` contradicts a file, or if the files have several.
     OptionError
-        If ``bbox`` is no box or a column name is none of ours.
+        If ``bbox`` is no box, ``delimiter`` not one character, or a column name none of ours.
 
     Examples
     --------
@@ -103,6 +103,8 @@ def read_fleet(
     """
     given = None if crs is None else parse_crs(crs)
     box = None if bbox is None else _checked_bbox(bbox)
+    if delimiter is not None and len(delimiter) != 1:
+        raise OptionError(f"delimiter {delimiter!r} is not one character", fix="use one, or leave it out")
     options = _Options(given, box, delimiter, header)
     trace_table, trace_crs, told = _read_all(traces, columns or {}, options, points=False)
     point_table, point_crs = None, trace_crs

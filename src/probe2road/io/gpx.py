@@ -7,6 +7,7 @@ collected in lists and converted together at the end. Routes and waypoints are n
 from __future__ import annotations
 
 import gzip
+import zlib
 from typing import Any
 from xml.parsers import expat
 
@@ -72,8 +73,9 @@ def _parse(source: SourceFile) -> dict[str, list[Any]]:
     except expat.ExpatError as error:
         fault = f"broken XML at line {error.lineno}, column {error.offset + 1}: {expat.ErrorString(error.code)}"
         raise InputError(fault, where=source.path, fix="repair that line, or export the file again") from error
-    except (OSError, EOFError) as error:
-        raise InputError(f"broken gzip ({error})", where=source.path, fix="copy the file again") from error
+    except (OSError, EOFError, zlib.error) as error:
+        fault = "broken gzip" if source.path.suffix.lower() == ".gz" else "the file cannot be read"
+        raise InputError(f"{fault} ({error})", where=source.path, fix="copy it again") from error
     return lists
 
 
