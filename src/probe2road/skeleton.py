@@ -34,16 +34,16 @@ _SET, _QUEUED_FIRST, _QUEUED_SECOND = np.uint8(1), np.uint8(2), np.uint8(4)  # b
 def skeletonize(mask: NDArray[Any], *, method: Method = "guo_hall") -> NDArray[np.bool_]:
     """Thin a mask to lines one pixel wide.
 
-    Connected parts stay connected, holes stay holes, ends of lines are kept. Outside the mask is background,
-    so a road that runs off the mask is thinned up to the border as any other. An empty mask gives an empty
-    skeleton.
+    With Guo-Hall connected parts stay connected, holes stay holes, and ends of lines are kept. Outside the mask
+    is background, so a road that runs off the mask is thinned up to the border as any other. An empty mask
+    gives an empty skeleton.
 
     Parameters
     ----------
     mask
         Shape ``(rows, cols)``; everything that is not zero is road.
     method
-        ``guo_hall``, or ``zhang_suen``, which leaves diagonals two pixels wide and can delete squares of 2 x 2.
+        ``guo_hall``, or ``zhang_suen``, which can wear away diagonals and squares two pixels wide.
 
     Returns
     -------

@@ -38,7 +38,7 @@ _HALF_DIAGONAL = 0.5**0.5  # px; farthest that smoothing moves a vertex
 class VectorizeOptions:
     """How pixel lines become road geometry."""
 
-    smoothing: float = 3.0  # m, standard deviation of the smoothing along the line; 0 switches it off
+    smoothing: float = 2.0  # m, standard deviation of the smoothing along the line; 0 switches it off
     simplify_tolerance: float = 1.0  # m, Douglas-Peucker; 0 keeps every vertex
 
     def __post_init__(self) -> None:
