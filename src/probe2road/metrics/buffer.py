@@ -72,6 +72,7 @@ def buffer_geo_networks(proposal: Network, reference: Network, options: BufferGe
     """Score normalised networks, as `buffer_geo`."""
     segments = [_distinct_segments(network) for network in (proposal, reference)]
     lengths = [np.hypot(*(part[:, 1] - part[:, 0]).T) for part in segments]
+    totals = [float(length.sum()) for length in lengths]
     gaps, weights = [], []
     for own, other in ((0, 1), (1, 0)):
         xy, weight = _middles(segments[own], lengths[own], options.spacing)
@@ -79,13 +80,16 @@ def buffer_geo_networks(proposal: Network, reference: Network, options: BufferGe
         weights.append(weight)
     scores = []
     for radius in options.radii:
-        near = [float(weight[gap <= radius].sum()) for gap, weight in zip(gaps, weights, strict=True)]
+        near = [
+            min(float(weight[gap <= radius].sum()), total)  # the parts of a whole can add up to a rounding more
+            for gap, weight, total in zip(gaps, weights, totals, strict=True)
+        ]
         score = Score.from_counts(
             "buffer_geo",
             matched_proposal=near[0],
-            proposal=float(lengths[0].sum()),
+            proposal=totals[0],
             matched_reference=near[1],
-            reference=float(lengths[1].sum()),
+            reference=totals[1],
             parameters={"radius": radius, "spacing": options.spacing},
             details={"proposal_km": round(proposal.km, 3), "reference_km": round(reference.km, 3)},
         )

@@ -69,7 +69,7 @@ def evaluate(
     area
         Clip both graphs to this polygon or ``(left, bottom, right, top)`` first, in the CRS of the reference.
     merge
-        Whether to merge nodes of degree 2 first. Without it scores depend on how edges are cut.
+        Whether to drop twin edges and merge nodes of degree 2 first. Without it scores depend on how edges are cut.
 
     Returns
     -------

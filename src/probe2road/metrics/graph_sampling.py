@@ -24,7 +24,7 @@ class GraphSamplingOptions:
     radii: tuple[float, ...] = (5.0, 10.0, 15.0)  # m, one score each
     spacing: float = 5.0  # m of network distance between samples
     max_angle: float = 45.0  # degrees between the roads of matched samples, as undirected lines
-    matching: Matching = "optimal"  # as many pairs as possible; or greedy, global
+    matching: Matching = "greedy"  # in proposal order; global or optimal as in `match_one_to_one`
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""

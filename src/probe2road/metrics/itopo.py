@@ -2,8 +2,9 @@
 
 Strategy. Every node of either graph (degree 1, or 3 and more) is a centre. Its surroundings in its own graph are
 what lies within 30 m of network distance; its surroundings in the other graph start at its projection onto the
-closest edge within 6 m there. Both are sampled outward from their centres (`sample_around`), so that two correct
-junctions yield the same samples however their edges are cut, and the samples of each pair are matched as in GEO.
+closest edge within 6 m there (or, as an option, at the closest node). Both are sampled outward from their centres
+(`sample_around`), so that two correct junctions yield the same samples however their edges are cut, and the
+samples of each pair are matched as in GEO.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 import shapely
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from probe2road.errors import OptionError
 from probe2road.metrics.matching import require_positive
@@ -38,12 +40,15 @@ class ItopoOptions:
     strict: bool = False  # precision from the proposal's nodes only, recall from the reference's only
     tie: float = 0.1  # m; edges that much farther than the closest tie with it, and the direction decides
     branch: float = 10.0  # m over which the direction of a branch is measured
+    centre: Literal["projection", "node"] = "projection"  # or the other graph's nearest node, where one is in radius
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
         require_positive("ItopoOptions", spacing=self.spacing, radius=self.radius, reach=self.reach, branch=self.branch)
         if self.average not in ("micro", "macro"):
             raise OptionError(f"average is {self.average!r}", where="ItopoOptions", fix="use micro or macro")
+        if self.centre not in ("projection", "node"):
+            raise OptionError(f"centre is {self.centre!r}", where="ItopoOptions", fix="use projection or node")
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,9 @@ def itopo(proposal: RoadGraph, reference: RoadGraph, options: ItopoOptions | Non
     Notes
     -----
     METHOD 6.5. Each superfluous node of the proposal whose surroundings are right adds matches, so more nodes mean
-    more recall: read it beside GEO and the numbers of nodes, or set ``strict``.
+    more recall: read it beside GEO and the numbers of nodes, or set ``strict``. A junction that is off along a road
+    has its projection beside the other junction, so that the samples of the roads that cross slip by as much: four
+    arms shifted by (4, 4) m score 12 of 13. ``centre="node"`` pairs the two junctions themselves: 13 of 13.
 
     Examples
     --------
@@ -146,6 +153,8 @@ def itopo_pairs(proposal: Network, reference: Network, options: ItopoOptions) ->
     for network, other in ((proposal, reference), (reference, proposal)):
         nodes = np.flatnonzero((network.degree == 1) | (network.degree > 2))
         edge, offset = project_nodes(network, nodes, other, options)
+        if options.centre == "node":
+            edge, offset = _snap_to_nodes(network.node_xy[nodes], other, edge, offset, options.radius)
         own = sample_around(network, Centres.from_nodes(nodes), radius=options.reach, spacing=options.spacing)
         there = sample_around(
             other, Centres.from_positions(edge, offset), radius=options.reach, spacing=options.spacing
@@ -186,6 +195,25 @@ def project_nodes(
     kept = order[np.unique(row[order], return_index=True)[1]]
     edge[row[kept]], offset[row[kept]] = candidate[kept], along[kept]
     return edge, offset
+
+
+def _snap_to_nodes(
+    xy: NDArray[np.float64],
+    other: Network,
+    edge: NDArray[np.int64],
+    offset: NDArray[np.float64],
+    radius: float,
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Move positions to the nearest junction or dead end of the other network within the radius, where there is one."""
+    nodes = np.flatnonzero((other.degree == 1) | (other.degree > 2))
+    if len(nodes) == 0:
+        return edge, offset
+    gap, nearest = cKDTree(other.node_xy[nodes]).query(xy)
+    node = nodes[nearest]
+    at_node = other.incident_edge[other.incident_first[node]]
+    near = gap <= radius + EPSILON
+    start = np.where(other.u[at_node] == node, 0.0, other.length[at_node])
+    return np.where(near, at_node, edge), np.where(near, start, offset)
 
 
 def _angle_to_branches(

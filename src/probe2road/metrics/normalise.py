@@ -1,4 +1,4 @@
-"""What both graphs go through before any metric: one CRS, one area, no nodes of degree 2."""
+"""What both graphs go through before any metric: one CRS, one area, no twin edges, no nodes of degree 2."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from probe2road.errors import InputError
 from probe2road.metrics.network import EPSILON, Network, locate, network_from_graph
 from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
 
-__all__ = ["clip_graph", "comparable", "comparable_networks"]
+__all__ = ["clip_graph", "comparable", "comparable_networks", "drop_twin_edges"]
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ def comparable(
         Where to compare, in the CRS of the reference: a polygon, or ``(left, bottom, right, top)``. Both graphs
         are clipped by `clip_graph`. Leave a margin of 50 m or so to where the data ends: clipping makes dead ends.
     merge
-        Whether to merge nodes of degree 2, after clipping.
+        Whether to drop twins (`drop_twin_edges`) and then merge nodes of degree 2, after clipping.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def comparable(
     if area is not None:
         graphs = [clip_graph(graph, area) for graph in graphs]
     if merge:
-        graphs = [merge_degree_two_nodes(graph) for graph in graphs]
+        graphs = [merge_degree_two_nodes(drop_twin_edges(graph)) for graph in graphs]
     return graphs[0], graphs[1]
 
 
@@ -71,6 +71,28 @@ def comparable_networks(
     """Return `comparable` graphs as arrays."""
     first, second = comparable(proposal, reference, area=area, merge=merge)
     return network_from_graph(first), network_from_graph(second)
+
+
+def drop_twin_edges(graph: RoadGraph) -> RoadGraph:
+    """Keep one of the edges that join the same nodes along the same line, whichever way they are drawn.
+
+    Maps with one edge per direction draw such twins; in an undirected graph they are one road. Roads one above the
+    other have different nodes and stay. The first edge is kept as it is; turns are dropped where a twin is.
+
+    Examples
+    --------
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> lines = [[(0, 0), (9, 0)], [(9, 0), (0, 0)], [(0, 0), (4, 4), (9, 0)]]
+    >>> drop_twin_edges(graph_from_lines(lines, crs="EPSG:32616")).edges["length"].round(1).tolist()
+    [9.0, 12.1]
+    """
+    edges = graph.edges
+    line = shapely.to_wkb(shapely.normalize(shapely.force_2d(edges.geometry.to_numpy())))
+    low, high = edges[["u", "v"]].min(axis=1), edges[["u", "v"]].max(axis=1)
+    twin = pd.DataFrame({"low": low, "high": high, "line": line}).duplicated().to_numpy()
+    if not twin.any():
+        return graph
+    return replace(graph, edges=finish_edges(edges[~twin]), turns=empty_turns())
 
 
 def clip_graph(graph: RoadGraph, area: Any) -> RoadGraph:

@@ -1,0 +1,188 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.optimize import linear_sum_assignment
+
+from probe2road.errors import CRSError, OptionError
+from probe2road.metrics import HE_BALAKRISHNAN_2022, GeoOptions, geo, scores_table
+from probe2road.metrics.network import network_from_graph
+from probe2road.metrics.sampling import sample_edges
+from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
+
+CRS = "EPSG:32616"
+Streets = Callable[..., RoadGraph]
+
+
+def graph(*lines: object) -> RoadGraph:
+    return graph_from_lines(list(lines), crs=CRS)
+
+
+def quarter_circle(radius: float) -> RoadGraph:
+    angle = np.linspace(0.0, np.pi / 2, 20_001)
+    return graph(radius * np.column_stack([np.cos(angle), np.sin(angle)]))
+
+
+def counts(proposal: RoadGraph, reference: RoadGraph, options: GeoOptions | None = None) -> tuple[int, int, int]:
+    score = geo(proposal, reference, options)
+    return int(score.matched_proposal), int(score.proposal), int(score.reference)
+
+
+@pytest.mark.parametrize(
+    ("length", "spacing", "expected"),
+    [
+        (10, 5, [0, 5, 10]),
+        (9, 3, [0, 3, 6, 9]),
+        (12, 5, [0, 5, 10, 12]),
+        (10, 10, [0, 10]),
+        (10, 11, [0, 10]),
+        (10, 0, []),
+        (10, -1, []),
+    ],
+)
+def test_sampling_of_a_straight_line(length: float, spacing: float, expected: list[float]) -> None:
+    samples = sample_edges(network_from_graph(graph([(0, 0), (length, 0)])), spacing)
+    assert samples.xy[:, 0].tolist() == expected
+
+
+def test_sampling_goes_round_corners_and_keeps_no_vertices() -> None:
+    samples = sample_edges(network_from_graph(graph([(0, 0), (4.5, 0), (4.5, 4.5)])), 3.0)
+    assert samples.xy.tolist() == [[0, 0], [3, 0], [4.5, 1.5], [4.5, 4.5]]
+
+
+def test_a_shared_node_is_sampled_once() -> None:
+    samples = sample_edges(network_from_graph(graph([(0, 0), (5, 0)], [(0, 0), (0, 5)], [(0, 0), (-5, 0)])), 11.0)
+    assert samples.xy.tolist() == [[0, 0], [5, 0], [0, 5], [-5, 0]]
+
+
+def test_noise_in_the_length_makes_no_sample() -> None:
+    far = 4_600_000.1  # m; coordinates as large as this carry noise of a nanometre
+    samples = sample_edges(network_from_graph(graph([(far, far), (far + 33.0 + 1e-9, far)])), 11.0)
+    assert len(samples.edge) == 4
+
+
+def test_identical_lines_are_perfect() -> None:
+    score = geo(graph([(0, 0), (100, 40)]), graph([(0, 0), (100, 40)]))
+    assert (score.precision, score.recall, score.f1) == (1.0, 1.0, 1.0)
+
+
+def test_worked_example_of_a_line_half_as_long() -> None:
+    score = geo(graph([(0, 0), (6, 0)]), graph([(0, 0), (6, 0), (12, 0)]))
+    assert (score.precision, score.recall, score.f1) == pytest.approx((1.0, 2 / 3, 0.8))
+
+
+@pytest.mark.parametrize(
+    ("radius", "expected"), [(300, (44, 44, 44)), (302, (44, 45, 44)), (304, (32, 45, 44)), (305, (21, 45, 44))]
+)
+def test_concentric_quarter_circles(radius: float, expected: tuple[int, int, int]) -> None:
+    assert counts(quarter_circle(radius), quarter_circle(300)) == expected
+
+
+def test_the_radius_is_inclusive() -> None:
+    reference = graph([(0, 0), (100, 0)])
+    assert geo(graph([(0, 6), (100, 6)]), reference).f1 == 1.0
+    assert geo(graph([(0, 6.001), (100, 6.001)]), reference).f1 == 0.0
+
+
+def test_duplicates_cost_precision_only() -> None:
+    score = geo(graph([(0, 0), (100, 0)], [(0, 2), (100, 2)]), graph([(0, 1), (100, 1)]))
+    assert (score.precision, score.recall) == (0.5, 1.0)
+
+
+def test_roads_along_and_across_are_told_apart_on_request() -> None:
+    proposal, reference = graph([(0, -5), (0, 5)]), graph([(-5, 0), (5, 0)])
+    assert geo(proposal, reference, GeoOptions(radius=8.0)).f1 == 1.0
+    assert geo(proposal, reference, GeoOptions(radius=8.0, max_angle=60.0)).f1 == 0.0
+
+
+def test_scores_do_not_depend_on_how_edges_are_cut() -> None:
+    whole = graph([(0, 0), (100, 0)])
+    cut = graph([(0, 0), (31, 0)], [(77, 0), (31, 0)], [(77, 0), (100, 0)])
+    assert counts(cut, whole) == counts(whole, whole) == (11, 11, 11)
+
+
+@pytest.mark.parametrize("empty_side", ["proposal", "reference", "both"])
+def test_an_empty_graph_scores_zero(empty_side: str) -> None:
+    road, nothing = graph([(0, 0), (100, 0)]), empty_graph(CRS)
+    score = geo(*{"proposal": (nothing, road), "reference": (road, nothing), "both": (nothing, nothing)}[empty_side])
+    assert (score.precision, score.recall, score.f1) == (0.0, 0.0, 0.0)
+
+
+def test_the_proposal_is_reprojected_to_the_reference() -> None:
+    reference = graph([(440_000, 4_635_000), (440_900, 4_635_300)])
+    assert geo(reference.to_crs("EPSG:32615"), reference).f1 == 1.0
+
+
+def test_degrees_are_refused() -> None:
+    road = graph([(440_000, 4_635_000), (440_900, 4_635_300)])
+    degrees = RoadGraph(road.nodes.to_crs(4326), road.edges.to_crs(4326), road.turns)
+    with pytest.raises(CRSError, match="reference: coordinates are in degrees"):
+        geo(road, degrees)
+
+
+def test_phases_even_out_an_offset_that_is_all_or_nothing() -> None:
+    reference = graph([(0, 0), (5000, 0)])
+    lucky, unlucky = graph([(0, 4.0), (5000, 4.0)]), graph([(-5.5, 4.0), (4994.5, 4.0)])
+    assert geo(lucky, reference).precision == 1.0
+    assert geo(unlucky, reference).precision < 0.01
+    smooth = [geo(proposal, reference, GeoOptions(phases=11)).precision for proposal in (lucky, unlucky)]
+    expected = 2 * np.sqrt(36 - 16) / 11  # METHOD 6.1: the share of phases that match at 4 m
+    assert smooth == pytest.approx([expected, expected], abs=0.09)
+
+
+def brute_force_geo(proposal: RoadGraph, reference: RoadGraph, radius: float) -> int:
+    samples, targets = (sample_edges(network_from_graph(side), 11.0).xy for side in (proposal, reference))
+    used: set[int] = set()
+    for point in samples:
+        gaps = np.hypot(*(targets - point).T)
+        free = [int(j) for j in np.argsort(gaps, kind="stable") if gaps[j] <= radius and j not in used]
+        used.update(free[:1])
+    return len(used)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_greedy_matching_equals_brute_force(seed: int, streets: Streets) -> None:
+    proposal, reference = streets(seed), streets(seed + 100)
+    options = GeoOptions(radius=8.0)
+    from probe2road.metrics import comparable
+
+    assert counts(proposal, reference, options)[0] == brute_force_geo(*comparable(proposal, reference), 8.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_optimal_matching_equals_an_assignment(seed: int, streets: Streets) -> None:
+    from probe2road.metrics import comparable
+
+    first, second = comparable(streets(seed), streets(seed + 100))
+    samples, targets = (sample_edges(network_from_graph(side), 11.0).xy for side in (first, second))
+    near = np.hypot(*(samples[:, None] - targets[None]).transpose(2, 0, 1)) <= 8.0
+    rows, columns = linear_sum_assignment(near, maximize=True)
+    matched = {how: counts(first, second, GeoOptions(radius=8.0, matching=how))[0] for how in ("greedy", "optimal")}
+    assert matched["optimal"] == near[rows, columns].sum() >= matched["greedy"]
+
+
+def test_the_variant_of_he_and_balakrishnan() -> None:
+    reference = graph([(0, 0), (100, 0)])
+    assert geo(graph([(0, 0.9), (100, 0.9)]), reference, HE_BALAKRISHNAN_2022).f1 == 1.0
+    assert geo(graph([(0, 1.1), (100, 1.1)]), reference, HE_BALAKRISHNAN_2022).f1 == 0.0
+
+
+def test_parameters_stand_in_the_row() -> None:
+    row = scores_table([geo(graph([(0, 0), (100, 0)]), graph([(0, 0), (100, 0)]))]).iloc[0]
+    assert json.loads(row["parameters"]) == {
+        "spacing": 11.0,
+        "radius": 6.0,
+        "matching": "greedy",
+        "max_angle": None,
+        "phases": 1,
+    }
+    assert json.loads(row["details"]) == {"proposal_km": 0.1, "reference_km": 0.1}
+
+
+@pytest.mark.parametrize("options", [{"spacing": 0.0}, {"radius": -1.0}, {"matching": "best"}, {"phases": 0}])
+def test_options_out_of_range_are_refused(options: dict[str, object]) -> None:
+    with pytest.raises(OptionError, match="GeoOptions"):
+        GeoOptions(**options)  # type: ignore[arg-type]
