@@ -1,0 +1,1 @@
+"""Counts in, centreline probability out: segmenters behind one interface."""

@@ -1,0 +1,218 @@
+"""Centreline probability from trace density alone: needs no weights and no camera.
+
+Strategy
+--------
+Traces blur into a kernel density. A threshold on it alone either loses lightly driven roads or lets busy ones
+bloom until they swallow their neighbours, so a pixel must also lie on a ridge: the density has to curve
+downwards across the road, measured by the most negative eigenvalue of its Hessian relative to the density
+itself. That ratio does not depend on how many vehicles drove, only on where the pixel lies in the bundle of
+their traces: at the middle of a bundle of spread s seen with bandwidth b it is b^2 / (b^2 + s^2), and it falls
+to zero at the distance sqrt(b^2 + s^2) from it.
+
+The bandwidth decides which traces are one road. It is taken from the data: a ladder of bandwidths is climbed
+until the network stops falling apart into single traces, which shows as the length of all ridges no longer
+shrinking from one rung to the next. Metre-level fleet data settles at the bottom of the ladder, consumer GNSS
+in a city near its top, and neither needs a parameter.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from probe2road.errors import OptionError
+from probe2road.fleet import Fleet, TraceGaps
+from probe2road.grid import Grid
+from probe2road.raster import rasterize_windows
+from probe2road.segmentation.segmenter import Segmenter
+from probe2road.skeleton import skeletonize
+
+__all__ = ["DensityOptions", "density_probability", "density_segmenter", "estimate_bandwidth"]
+
+logger = logging.getLogger(__name__)
+
+_TRUNCATE = 4.5  # kernel half-width, bandwidths; a shorter one ends in a step that curves like a ridge
+_LADDER = (3.0, 3.75, 4.7, 5.9, 7.3, 9.1, 11.4)  # m, each a quarter more than the one before
+_SETTLED = 1.05  # ridge length over that of the next rung, below which the network holds together
+_COMFORT = 1.5  # bandwidth used over the finest that holds the network together
+_SAMPLE_WINDOW = 1000.0  # m, side of the windows the bandwidth is estimated on
+_SAMPLE_WINDOWS = 6  # how many, those with the most traffic
+
+
+@dataclass(frozen=True)
+class DensityOptions:
+    """How density becomes probability."""
+
+    bandwidth: float | None = None  # m, Gaussian sigma; estimated from the data where None
+    half_evidence: float = 1.0  # traces on a ridge at which the probability is one half
+    half_ridge: float = 0.3  # relative curvature at which it is one half
+    threshold: float = 0.5  # probability that continues a road
+    seed_threshold: float = 0.67  # probability that starts one: two traces on a ridge
+
+    def __post_init__(self) -> None:
+        """Refuse values that mean nothing."""
+        if self.bandwidth is not None and not self.bandwidth > 0:
+            raise OptionError(f"bandwidth is {self.bandwidth} m", where="DensityOptions", fix="use metres above 0")
+        if not 0 < self.threshold <= self.seed_threshold < 1:
+            raise OptionError(
+                f"threshold {self.threshold} and seed_threshold {self.seed_threshold} are not in order",
+                where="DensityOptions",
+                fix="use 0 < threshold <= seed_threshold < 1",
+            )
+
+
+def density_segmenter(
+    fleet: Fleet, grid: Grid, options: DensityOptions | None = None, *, gaps: TraceGaps | None = None
+) -> Segmenter:
+    """Return the density segmenter for a fleet, its bandwidth settled.
+
+    Parameters
+    ----------
+    fleet
+        The fleet; only its traces are used.
+    grid
+        Grid of the rasters to come.
+    options
+        How density becomes probability.
+    gaps
+        Where traces are broken.
+
+    Returns
+    -------
+    Segmenter
+        Named ``density``.
+    """
+    options = options or DensityOptions()
+    if options.bandwidth is None:
+        options = replace(options, bandwidth=estimate_bandwidth(fleet, grid, options, gaps=gaps))
+    settled = options
+    assert settled.bandwidth is not None
+
+    def predict(counts: NDArray[np.uint32], window: Grid) -> NDArray[np.float32]:
+        return density_probability(counts[0], window, settled)
+
+    return Segmenter(
+        name="density",
+        predict=predict,
+        halo=_halo(settled.bandwidth, grid),
+        threshold=options.threshold,
+        seed_threshold=options.seed_threshold,
+        parameters=asdict(settled),
+    )
+
+
+def density_probability(trace_counts: NDArray[np.uint32], grid: Grid, options: DensityOptions) -> NDArray[np.float32]:
+    """Return the probability that pixels lie on a centreline, from the trace channel.
+
+    Parameters
+    ----------
+    trace_counts
+        Shape ``(rows, cols)``; outside counts as empty.
+    grid
+        Its grid.
+    options
+        With a bandwidth.
+
+    Returns
+    -------
+    ndarray of float32, shape (rows, cols)
+        In [0, 1); 0 where there is no trace nearby.
+
+    Raises
+    ------
+    OptionError
+        If the bandwidth is not set.
+
+    Examples
+    --------
+    Five vehicles on one line: certain on it, nothing beside it.
+
+    >>> counts = np.zeros((41, 41), np.uint32)
+    >>> counts[20] = 5
+    >>> grid = Grid.from_bounds((1000, 0, 1040.5, 40.5), crs="EPSG:32616")
+    >>> probability = density_probability(counts, grid, DensityOptions(bandwidth=3.0))
+    >>> probability[[20, 10], 20].tolist()
+    [0.83..., 0.0]
+    """
+    if options.bandwidth is None:
+        raise OptionError("no bandwidth", where="DensityOptions", fix="set one, or use density_segmenter")
+    sigma = options.bandwidth / grid.resolution
+    density = ndimage.gaussian_filter(trace_counts.astype(np.float32), sigma, mode="constant", truncate=_TRUNCATE)
+    return _ridge_probability(density, sigma, options.half_evidence, options.half_ridge)
+
+
+def estimate_bandwidth(
+    fleet: Fleet, grid: Grid, options: DensityOptions | None = None, *, gaps: TraceGaps | None = None
+) -> float:
+    """Return a bandwidth (m) at which the network does not fall apart into single traces.
+
+    Measured on the windows with the most traffic: one and a half times the finest bandwidth of a ladder whose
+    next rung shortens the network by less than a twentieth. The order and the direction of the traces do not
+    matter, nor do changes too small to move the result to another rung.
+
+    Returns
+    -------
+    float
+        Metres, 4.5 to 17.
+    """
+    options = options or DensityOptions()
+    size = round(_SAMPLE_WINDOW / grid.resolution)
+    traffic = {window: int(counts[0].sum()) for window, counts in rasterize_windows(fleet, grid, size=size, gaps=gaps)}
+    busiest = set(sorted(traffic, key=lambda window: (-traffic[window], window.row, window.col))[:_SAMPLE_WINDOWS])
+    windows = rasterize_windows(fleet, grid, size=size, gaps=gaps)
+    samples = [counts[0] for window, counts in windows if window in busiest]
+    finest, length = _LADDER[0], _ridge_length(samples, grid, replace(options, bandwidth=_LADDER[0]))
+    for coarser in _LADDER[1:]:
+        shorter = _ridge_length(samples, grid, replace(options, bandwidth=coarser))
+        if length < _SETTLED * shorter:
+            break
+        finest, length = coarser, shorter
+    bandwidth = _COMFORT * finest
+    logger.info("bandwidth %.1f m: ridges settle at %.1f m", bandwidth, finest)
+    return bandwidth
+
+
+def _ridge_length(samples: list[NDArray[np.uint32]], grid: Grid, options: DensityOptions) -> int:
+    """Count the pixels of the thinned ridges."""
+    masks = (density_probability(sample, grid, options) >= options.threshold for sample in samples)
+    return sum(int(skeletonize(mask).sum()) for mask in masks)
+
+
+def _halo(bandwidth: float, grid: Grid) -> int:
+    """Context of a pixel: the kernel's half-width as scipy rounds it, and one pixel for the Hessian."""
+    return int(_TRUNCATE * bandwidth / grid.resolution + 0.5) + 1
+
+
+@njit(cache=True)
+def _ridge_probability(
+    density: NDArray[np.float32], sigma: float, half_evidence: float, half_ridge: float
+) -> NDArray[np.float32]:
+    """Probability ``(rows, cols)`` from density ``(rows, cols)``; the outermost pixels stay 0.
+
+    The evidence is the density on the scale of traces: a single straight trace has 1 on its line.
+    """
+    rows, cols = density.shape
+    probability = np.zeros((rows, cols), np.float32)
+    to_traces = sigma * np.sqrt(2.0 * np.pi)
+    for r in range(1, rows - 1):
+        for c in range(1, cols - 1):
+            here = density[r, c]
+            if here <= 0.0:
+                continue
+            d_rr = density[r + 1, c] - 2.0 * here + density[r - 1, c]
+            d_cc = density[r, c + 1] - 2.0 * here + density[r, c - 1]
+            d_rc = 0.25 * (
+                density[r + 1, c + 1] - density[r + 1, c - 1] - density[r - 1, c + 1] + density[r - 1, c - 1]
+            )
+            across = 0.5 * (d_rr + d_cc) - np.sqrt(0.25 * (d_rr - d_cc) ** 2 + d_rc**2)
+            ridge = -across * sigma * sigma / here
+            if ridge <= 0.0:
+                continue
+            evidence = here * to_traces
+            probability[r, c] = min(evidence / (evidence + half_evidence), 0.5 * ridge / half_ridge)
+    return probability

@@ -1,0 +1,74 @@
+"""Probability to mask, with memory for the road pixels rather than for the area."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from probe2road.errors import OptionError
+
+__all__ = ["threshold_mask"]
+
+_STRIP = 1024  # rows looked at together
+
+
+def threshold_mask(
+    probability: NDArray[Any], *, threshold: float, seed_threshold: float | None = None
+) -> NDArray[np.bool_]:
+    """Return where the probability reaches a threshold, in parts that somewhere reach a higher one.
+
+    Parameters
+    ----------
+    probability
+        Shape ``(rows, cols)``.
+    threshold
+        Probability from which a pixel can belong to a road (METHOD 0.1 row 12).
+    seed_threshold
+        Probability that an 8-connected part must reach somewhere to be kept; every part is kept where None.
+
+    Returns
+    -------
+    ndarray of bool, shape (rows, cols)
+
+    Raises
+    ------
+    OptionError
+        If the seed threshold is below the threshold.
+
+    Examples
+    --------
+    >>> threshold_mask(np.array([[0.6, 0.9, 0.1, 0.6]]), threshold=0.5, seed_threshold=0.8).astype(int)
+    array([[1, 1, 0, 0]])
+    """
+    seed_threshold = threshold if seed_threshold is None else seed_threshold
+    if seed_threshold < threshold:
+        raise OptionError(f"seed threshold {seed_threshold} is below threshold {threshold}", where="threshold_mask")
+    rows, cols = probability.shape
+    strips = [
+        np.flatnonzero(probability[top : top + _STRIP] >= threshold) + top * cols for top in range(0, rows, _STRIP)
+    ]
+    pixels = np.concatenate([np.zeros(0, np.int64), *strips])
+    part = _parts(pixels, cols)
+    certain = np.zeros(part.max(initial=-1) + 1, bool)
+    certain[part[probability.reshape(-1)[pixels] >= seed_threshold]] = True
+    mask = np.zeros((rows, cols), bool)
+    mask.reshape(-1)[pixels[certain[part]]] = True
+    return mask
+
+
+def _parts(pixels: NDArray[np.int64], cols: int) -> NDArray[np.int64]:
+    """Label the 8-connected parts of a set of pixels given by ascending flat indices."""
+    pairs = []
+    col = pixels % cols
+    for step, inside in ((1, col < cols - 1), (cols - 1, col > 0), (cols, col >= 0), (cols + 1, col < cols - 1)):
+        own = np.flatnonzero(inside)
+        other = np.searchsorted(pixels, pixels[own] + step)
+        met = pixels[np.minimum(other, len(pixels) - 1)] == pixels[own] + step
+        pairs.append((own[met], other[met]))
+    first, second = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    links = coo_array((np.ones(len(first), bool), (first, second)), shape=(len(pixels), len(pixels)))
+    return np.asarray(connected_components(links, directed=False)[1], np.int64)
