@@ -1,4 +1,8 @@
-"""Time the metrics on two generated street graphs: python benchmarks/bench_metrics.py [--km 500]."""
+"""Time the metrics on two generated street graphs, and measure what is known to be wrong with GEO and iTOPO.
+
+python benchmarks/bench_metrics.py [--km 500]
+python benchmarks/bench_metrics.py --flaws
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from probe2road.metrics import METRICS, comparable, evaluate
+from probe2road.metrics import METRICS, GeoOptions, ItopoOptions, comparable, evaluate, geo
 from probe2road.roadgraph import RoadGraph, graph_from_lines
 
 BLOCK = 100.0  # m between corners
@@ -44,11 +48,52 @@ def graphs(km: float, *, noise: float = 1.5, seed: int = 0) -> tuple[RoadGraph, 
     return graph_from_lines(proposal, crs="EPSG:32616"), graph_from_lines(reference, crs="EPSG:32616")
 
 
+def print_flaws() -> None:
+    """Print GEO by the phase of a straight road, iTOPO by superfluous nodes, and the readings of both metrics."""
+    reference = graph_from_lines([[(0, 0), (5000, 0)]], crs="EPSG:32616")
+    print("GEO F1 of a straight road, by lateral offset: lowest, highest, mean over phases; range with phases=11")
+    for offset in (3.0, 4.0, 5.0, 5.9):
+        moved = [
+            graph_from_lines([[(-phase, offset), (5000 - phase, offset)]], crs="EPSG:32616")
+            for phase in np.arange(0.0, 11.0, 0.5)
+        ]
+        plain = [geo(road, reference).f1 for road in moved]
+        pooled = [geo(road, reference, GeoOptions(phases=11)).f1 for road in moved]
+        numbers = (min(plain), max(plain), float(np.mean(plain)), min(pooled), max(pooled))
+        print(f"{offset:>6.1f} m" + "".join(f"{number:>8.3f}" for number in numbers))
+
+    rng = np.random.default_rng(0)
+    lines = street_lines(105.0, rng)
+    bare = [line for line in lines if rng.random() < 0.7]
+    stubs = [part for line in bare for part in (line[:6], line[5:], np.array([line[5], line[5] + 0.7]))]
+    streets = graph_from_lines(lines, crs="EPSG:32616")
+    for name, proposal in (("30 % missing", bare), ("and stubs", stubs)):
+        table = evaluate(
+            graph_from_lines(proposal, crs="EPSG:32616"), streets, metrics=["geo", "itopo", "itopo_strict"]
+        )
+        print(f"\n{name}\n{table[['metric', 'precision', 'recall', 'f1']].round(3)}\n{table['details'].iloc[1]}")
+
+    readings: list[GeoOptions | ItopoOptions] = [
+        *(GeoOptions(matching=how) for how in ("greedy", "global", "optimal")),
+        GeoOptions(phases=11),
+        ItopoOptions(),
+        ItopoOptions(centre="node"),
+        ItopoOptions(average="macro"),
+    ]
+    table = evaluate(*graphs(500.0), metrics=list(readings))
+    print(f"\nreadings\n{table[['metric', 'precision', 'recall', 'f1', 'parameters']].round(4).to_string()}")
+
+
 def main() -> None:
-    """Print one line for each metric."""
+    """Print one line for each metric, or the flaws."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--km", type=float, default=500.0)
-    km = parser.parse_args().km
+    parser.add_argument("--flaws", action="store_true", help="measure the known flaws instead of times")
+    arguments = parser.parse_args()
+    if arguments.flaws:
+        print_flaws()
+        return
+    km = arguments.km
     small = graphs(5.0)
     evaluate(*small, metrics=list(METRICS))  # compile
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 from probe2road.errors import CRSError, OptionError
-from probe2road.metrics import HE_BALAKRISHNAN_2022, GeoOptions, geo, scores_table
+from probe2road.metrics import HE_BALAKRISHNAN_2022, GeoOptions, comparable, geo, scores_table
 from probe2road.metrics.network import network_from_graph
 from probe2road.metrics.sampling import sample_edges
 from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
@@ -147,15 +147,11 @@ def brute_force_geo(proposal: RoadGraph, reference: RoadGraph, radius: float) ->
 def test_greedy_matching_equals_brute_force(seed: int, streets: Streets) -> None:
     proposal, reference = streets(seed), streets(seed + 100)
     options = GeoOptions(radius=8.0)
-    from probe2road.metrics import comparable
-
     assert counts(proposal, reference, options)[0] == brute_force_geo(*comparable(proposal, reference), 8.0)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_optimal_matching_equals_an_assignment(seed: int, streets: Streets) -> None:
-    from probe2road.metrics import comparable
-
     first, second = comparable(streets(seed), streets(seed + 100))
     samples, targets = (sample_edges(network_from_graph(side), 11.0).xy for side in (first, second))
     near = np.hypot(*(samples[:, None] - targets[None]).transpose(2, 0, 1)) <= 8.0

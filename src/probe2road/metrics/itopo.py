@@ -129,7 +129,7 @@ def itopo_networks(proposal: Network, reference: Network, options: ItopoOptions)
     else:
         precision, recall = ratio(proposed_matched.sum(), proposed.sum()), ratio(wanted_matched.sum(), wanted.sum())
     return Score(
-        "itopo",
+        "itopo_strict" if options.strict else "itopo",
         precision,
         recall,
         f_score(precision, recall),

@@ -183,25 +183,30 @@ def _samples(
     return Samples(first, edge, offset, *locate(network, edge, offset))
 
 
-# fmt: off
 @njit(cache=True)
 def _sample_around(
-    centre_node: NDArray[np.int64], centre_edge: NDArray[np.int64], centre_offset: NDArray[np.float64],
-    radius: float, spacing: float, ends: bool,
-    u: NDArray[np.int64], v: NDArray[np.int64], length: NDArray[np.float64],
-    incident_first: NDArray[np.int64], incident_edge: NDArray[np.int64],
+    centre_node: NDArray[np.int64],
+    centre_edge: NDArray[np.int64],
+    centre_offset: NDArray[np.float64],
+    radius: float,
+    spacing: float,
+    ends: bool,
+    u: NDArray[np.int64],
+    v: NDArray[np.int64],
+    length: NDArray[np.float64],
+    incident_first: NDArray[np.int64],
+    incident_edge: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Collect the samples of all centres; see the module for the strategy.
 
     A centre on an edge splits it into a half towards u and a half towards v, whose other ends lie at distance 0.
     ``parent`` holds the edge over which a node was reached: an edge, or one of the two halves.
     """
-# fmt: on
     n_nodes = len(incident_first) - 1
     distance = np.full(n_nodes, np.inf)
     parent = np.full(n_nodes, -1, np.int64)
     edge_seen, node_seen = np.full(len(u), -1, np.int64), np.full(n_nodes, -1, np.int64)
-    edges, offsets = [0 for _ in range(0)], [0.0 for _ in range(0)]
+    edges, offsets = [0 for _ in range(0)], [0.0 for _ in range(0)]  # empty, but of a type that numba can tell
     first = np.zeros(len(centre_node) + 1, np.int64)
     for c in range(len(centre_node)):
         node, e = centre_node[c], centre_edge[c]
@@ -243,19 +248,24 @@ def _sample_around(
     return first, np.array(edges, np.int64), np.array(offsets, np.float64)
 
 
-# fmt: off
 @njit(cache=True)
 def _reach(
-    node: int, edge: int, at: float, radius: float,
-    u: NDArray[np.int64], v: NDArray[np.int64], length: NDArray[np.float64],
-    incident_first: NDArray[np.int64], incident_edge: NDArray[np.int64],
-    distance: NDArray[np.float64], parent: NDArray[np.int64],
+    node: int,
+    edge: int,
+    at: float,
+    radius: float,
+    u: NDArray[np.int64],
+    v: NDArray[np.int64],
+    length: NDArray[np.float64],
+    incident_first: NDArray[np.int64],
+    incident_edge: NDArray[np.int64],
+    distance: NDArray[np.float64],
+    parent: NDArray[np.int64],
 ) -> list[int]:
     """Fill the distance of every node within the radius and the edge it was reached over; list them nearest first.
 
     Nodes reached straight from a centre on an edge have the parent -2 (its half towards u) or -3 (towards v).
     """
-# fmt: on
     heap = [(0.0, 0) for _ in range(0)]
     settled = [0 for _ in range(0)]
     if node >= 0:
@@ -284,20 +294,31 @@ def _reach(
     return settled
 
 
-# fmt: off
 @njit(cache=True)
 def _walk(
-    e: int, a: float, b: float, at_a: float, at_b: float, a_to_b: bool, b_to_a: bool,
-    radius: float, spacing: float, ends: bool, c: int,
-    u: NDArray[np.int64], v: NDArray[np.int64], length: NDArray[np.float64], node_seen: NDArray[np.int64],
-    edges: list[int], offsets: list[float],
+    e: int,
+    a: float,
+    b: float,
+    at_a: float,
+    at_b: float,
+    a_to_b: bool,
+    b_to_a: bool,
+    radius: float,
+    spacing: float,
+    ends: bool,
+    c: int,
+    u: NDArray[np.int64],
+    v: NDArray[np.int64],
+    length: NDArray[np.float64],
+    node_seen: NDArray[np.int64],
+    edges: list[int],
+    offsets: list[float],
 ) -> None:
     """Sample the stretch of edge ``e`` from offset ``a`` to ``b``, whose ends lie at given network distances.
 
     ``a_to_b`` and ``b_to_a`` say that the far end is reached over this very stretch. Otherwise branches enter from
     both ends in reach, up to where they meet or to the radius.
     """
-# fmt: on
     size = abs(b - a)
     through = a_to_b or b_to_a
     meets = not through and at_a + at_b + size <= 2.0 * radius

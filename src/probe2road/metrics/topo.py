@@ -175,15 +175,18 @@ def _matched_marbles(marbles: Samples, holes: Samples, options: TopoOptions) -> 
     return total[marbles.first[1:]] - total[marbles.first[:-1]]
 
 
-# fmt: off
 @njit(cache=True)
 def _pairs_of_starts(
-    a_first: NDArray[np.int64], a_xy: NDArray[np.float64], a_direction: NDArray[np.float64],
-    b_first: NDArray[np.int64], b_xy: NDArray[np.float64], b_direction: NDArray[np.float64],
-    radius: float, cosine: float,
+    a_first: NDArray[np.int64],
+    a_xy: NDArray[np.float64],
+    a_direction: NDArray[np.float64],
+    b_first: NDArray[np.int64],
+    b_xy: NDArray[np.float64],
+    b_direction: NDArray[np.float64],
+    radius: float,
+    cosine: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """List the pairs of points of the same start that are near and along one line; points ascend in x per start."""
-# fmt: on
     a_of_pair, b_of_pair = [0 for _ in range(0)], [0 for _ in range(0)]
     for start in range(len(a_first) - 1):
         low = b_first[start]
