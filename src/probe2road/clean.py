@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import connected_components
 
 from probe2road.errors import OptionError
 from probe2road.roadgraph import RoadGraph, finish_edges
-from probe2road.topology import Network, chains, contract_short_edges, end_nodes, mates
+from probe2road.topology import Network, chains, contract_short_edges, end_nodes, joined_lines, mates
 
 __all__ = [
     "CleanOptions",
@@ -183,8 +183,8 @@ def collapse_short_edges(graph: RoadGraph, *, max_length: float = 15.0, max_ring
     """Collapse edges of at most ``max_length`` (m) between two junctions, shortest first, to a fixed point.
 
     Two junctions become one in the middle, weighted by the number of junctions that went into each. Around
-    it, within the distance of the two, the other edges are replaced by straight lines to it, so that they do not
-    double back. Edges with a dead end are never collapsed, nor are loops.
+    it, within one and a half times the distance of the two, the other edges become straight lines to it, which
+    cuts off the hooks that thinning leaves there. Edges with a dead end are never collapsed, nor are loops.
 
     A collapse may shrink a ring, but must not destroy a road: edges whose smallest ring is longer than ``2
     max_length`` and at most ``max_ring`` stay, which keeps roundabouts, islands and small blocks as they are. On
@@ -297,7 +297,7 @@ def merge_degree_two_nodes(graph: RoadGraph) -> RoadGraph:
     merged = graph.edges.iloc[name].assign(
         u=node[np.where(backwards[starts], v[first], u[first])],
         v=node[np.where(backwards[stops - 1], u[last], v[last])],
-        geometry=_joined_lines(graph.edges.geometry.to_numpy(), members, backwards, starts),
+        geometry=joined_lines(graph.edges.geometry.to_numpy(), members, backwards, starts),
         **_joined_attributes(graph.edges, members, backwards, starts),
     )
     chain = np.empty(len(members), np.int64)
@@ -352,29 +352,6 @@ def _nodes_with_edges(nodes: gpd.GeoDataFrame, before: pd.DataFrame, after: pd.D
 def _require_length(value: float, name: str) -> None:
     if not 0 <= value < np.inf:
         raise OptionError(f"{name} is {value}", where="clean", fix="use 0 m or more")
-
-
-def _joined_lines(
-    lines: NDArray[Any], members: NDArray[np.int64], backwards: NDArray[np.bool_], starts: NDArray[np.int64]
-) -> NDArray[Any]:
-    """Concatenate lines along chains; the vertex that two members share appears once."""
-    joined = lines[members[starts]]
-    lengths = np.diff(np.append(starts, len(members)))
-    moving = np.flatnonzero(np.repeat(lengths > 1, lengths))  # single edges keep their line
-    chain = np.repeat(np.arange(len(starts)), lengths)[moving]
-    has_z = bool(shapely.has_z(lines).any())
-    coordinates, owner = shapely.get_coordinates(lines[members[moving]], include_z=has_z, return_index=True)
-    count = np.bincount(owner, minlength=len(moving))
-    offset = np.cumsum(count) - count
-    place = np.arange(len(coordinates)) - offset[owner]
-    flipped = backwards[moving][owner]
-    source = offset[owner] + np.where(flipped, count[owner] - 1 - place, place)
-    inner = np.diff(chain, prepend=-1) == 0  # members that follow another member of their chain
-    wanted = ~(inner[owner] & (place == 0))
-    if len(moving):
-        names, group = np.unique(chain[owner[wanted]], return_inverse=True)
-        joined[names] = shapely.linestrings(coordinates[source[wanted]], indices=group)
-    return joined
 
 
 def _joined_attributes(

@@ -161,11 +161,15 @@ def _thin_windows(mask: NDArray[Any], out: NDArray[np.bool_], window: int, halo:
     for top in range(0, rows, window):
         for left in range(0, cols, window):
             height, width = min(window, rows - top), min(window, cols - left)
+            core = slice(top, top + height), slice(left, left + width)
+            if not np.asarray(mask[core]).any():
+                out[core] = False
+                continue
             state = _padded_state(mask, top, left, height, width, halo=halo)
             if _thin(state, table, halo // 2, halo) >= halo // 2:
                 return False
             inner = state[halo + 1 : halo + 1 + height, halo + 1 : halo + 1 + width]
-            out[top : top + height, left : left + width] = inner & _SET
+            out[core] = inner & _SET
     return True
 
 

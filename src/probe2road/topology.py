@@ -13,12 +13,16 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import shapely
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["Network", "chains", "contract_short_edges", "end_nodes", "mates"]
+__all__ = ["Network", "chains", "contract_short_edges", "end_nodes", "joined_lines", "mates"]
+
+_FADE = 1.5  # times the distance of two contracted nodes; within it edges are led straight to the new node
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,29 @@ def chains(mate: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_
             filled += 1
             end = mate[end ^ 1]
     return members, backwards, starts[:n_chains]
+
+
+def joined_lines(
+    lines: NDArray[Any], members: NDArray[np.int64], backwards: NDArray[np.bool_], starts: NDArray[np.int64]
+) -> NDArray[Any]:
+    """Concatenate lines along chains; the vertex that two members share appears once."""
+    joined = lines[members[starts]]
+    lengths = np.diff(np.append(starts, len(members)))
+    moving = np.flatnonzero(np.repeat(lengths > 1, lengths))  # single edges keep their line
+    chain = np.repeat(np.arange(len(starts)), lengths)[moving]
+    has_z = bool(shapely.has_z(lines).any())
+    coordinates, owner = shapely.get_coordinates(lines[members[moving]], include_z=has_z, return_index=True)
+    count = np.bincount(owner, minlength=len(moving))
+    offset = np.cumsum(count) - count
+    place = np.arange(len(coordinates)) - offset[owner]
+    flipped = backwards[moving][owner]
+    source = offset[owner] + np.where(flipped, count[owner] - 1 - place, place)
+    inner = np.diff(chain, prepend=-1) == 0  # members that follow another member of their chain
+    wanted = ~(inner[owner] & (place == 0))
+    if len(moving):
+        names, group = np.unique(chain[owner[wanted]], return_inverse=True)
+        joined[names] = shapely.linestrings(coordinates[source[wanted]], indices=group)
+    return joined
 
 
 def contract_short_edges(network: Network, *, max_length: float, max_ring: float) -> tuple[Network, NDArray[np.int64]]:
@@ -193,7 +220,7 @@ def _contracted(
     weight[a] += weight[b]
     moved_to, radius = np.arange(len(position)), np.zeros(len(position))
     moved_to[b] = a
-    radius[a] = np.hypot(*(network.position[a] - network.position[b]).T)
+    radius[a] = _FADE * np.hypot(*(network.position[a] - network.position[b]).T)
 
     partner = np.full(len(position), -1)
     partner[a], partner[b] = b, a
@@ -256,30 +283,47 @@ def _rehung(
         if not kept[edge]:
             continue
         line = vertices[offsets[edge] : offsets[edge + 1]]
-        last = len(line) - 1
-        head, tail = 0.0, float(last)
+        start, stop = position[u[edge]], position[v[edge]]
+        head, tail = 0.0, len(line) - 1.0
         if u[edge] != v[edge]:
-            head = _exit(line, position[u[edge]], radius[u[edge]])
-            tail = last - _exit(line[::-1], position[v[edge]], radius[v[edge]])
-        out[filled] = line[0]
-        out[filled, :2] = position[u[edge]]
-        filled += 1
-        if head < tail:
-            if head > 0:
-                out[filled] = _point_at(line, head)
-                filled += 1
-            for place in range(int(np.floor(head)) + 1, int(np.ceil(tail))):
-                out[filled] = line[place]
-                filled += 1
-            if tail < last:
-                out[filled] = _point_at(line, tail)
-                filled += 1
-        out[filled] = line[last]
-        out[filled, :2] = position[v[edge]]
-        filled += 1
+            head = _exit(line, start, radius[u[edge]])
+            tail -= _exit(line[::-1], stop, radius[v[edge]])
+        filled += _copy_part(line, head, tail, start, stop, out[filled:])
         n_edges += 1
         out_offsets[n_edges] = filled
     return out[:filled].copy(), out_offsets
+
+
+@njit(cache=True)
+def _copy_part(
+    line: NDArray[np.float64],
+    head: float,
+    tail: float,
+    start: NDArray[np.float64],
+    stop: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> int:
+    """Write start, the part of a line between two places, and stop; return how many vertices these are.
+
+    The ends keep their heights. Where the places have passed each other, only the ends are left.
+    """
+    last = len(line) - 1
+    out[0] = line[0]
+    out[0, :2] = start
+    filled = 1
+    if head < tail:
+        if head > 0:
+            out[filled] = _point_at(line, head)
+            filled += 1
+        for place in range(int(np.floor(head)) + 1, int(np.ceil(tail))):
+            out[filled] = line[place]
+            filled += 1
+        if tail < last:
+            out[filled] = _point_at(line, tail)
+            filled += 1
+    out[filled] = line[last]
+    out[filled, :2] = stop
+    return filled + 1
 
 
 @njit(cache=True)
