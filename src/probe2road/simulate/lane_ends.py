@@ -83,9 +83,10 @@ def _two_way_ends(moves: pd.DataFrame, left_hand: bool) -> pd.DataFrame:
     back = both.rename(columns={"from_section": "to_section", "to_section": "from_section"})
     back = back.rename(columns={"from_count": "to_back_count", "to_count": "from_back_count"})
     both = both.merge(back[[*pair, "from_back_count", "to_back_count"]], on=pair)
-    host_lanes = both["from_count"] + both["from_back_count"]
-    guest_lanes = both["to_count"] + both["to_back_count"]
-    both = both[(guest_lanes > host_lanes) & (both["from_section"] != both["to_section"])]
+    both["host_lanes"] = both["from_count"] + both["from_back_count"]
+    both["guest_lanes"] = both["to_count"] + both["to_back_count"]
+    both = both[(both["guest_lanes"] > both["host_lanes"]) & (both["from_section"] != both["to_section"])]
+    host_lanes, guest_lanes = both["host_lanes"], both["guest_lanes"]
     # In the frame of travel from host to guest; the guest's own frame is the same where it is drawn that way.
     low = both["from_left"] if left_hand else both["from_right"] - host_lanes * both["from_width"]
     high = low + host_lanes * both["from_width"]

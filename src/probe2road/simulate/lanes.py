@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from probe2road.simulate.lane_ends import adapted_ends
 from probe2road.simulate.network import RoadNetwork
 
-__all__ = ["LATERAL", "lane_borders", "lane_offsets", "lateral_offset"]
+__all__ = ["LATERAL", "fade", "lane_borders", "lane_offsets", "lateral_offset", "taper_length"]
 
 # The columns that say where a lane or border lies along its section.
 LATERAL = ("offset", "start_offset", "end_offset", "start_taper", "end_taper")
@@ -96,7 +96,7 @@ def lane_borders(network: RoadNetwork) -> pd.DataFrame:
     offset = (border - lanes / 2.0) * width
     table = pd.DataFrame({"section": sections.index.to_numpy()[row], "border": border, "offset": offset})
     length = sections.length.to_numpy()
-    taper = np.minimum(np.clip(sections["speed_limit"].to_numpy() * _TAPER_SECONDS, *_TAPER_LENGTHS), length / 2.0)
+    taper = taper_length(sections["speed_limit"].to_numpy(), length)
     adapted = adapted_ends(network)
     for end in ("start", "end"):
         rule = adapted[adapted["end"] == end].drop_duplicates("section").set_index("section").reindex(table["section"])
@@ -136,12 +136,30 @@ def lateral_offset(table: pd.DataFrame, s: ArrayLike, length: ArrayLike) -> NDAr
     """
     s, length = np.asarray(s, float), np.asarray(length, float)
     column = {name: table[name].to_numpy() for name in LATERAL}
-    start = (column["start_offset"] - column["offset"]) * _fade(s / np.maximum(column["start_taper"], 1e-9))
-    end = (column["end_offset"] - column["offset"]) * _fade((length - s) / np.maximum(column["end_taper"], 1e-9))
+    start = (column["start_offset"] - column["offset"]) * fade(s / np.maximum(column["start_taper"], 1e-9))
+    end = (column["end_offset"] - column["offset"]) * fade((length - s) / np.maximum(column["end_taper"], 1e-9))
     return np.asarray(column["offset"] + start + end)
 
 
-def _fade(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Smooth step from 1 at 0 to 0 at 1."""
-    t = np.clip(t, 0.0, 1.0)
-    return 1.0 - t * t * (3.0 - 2.0 * t)
+def taper_length(speed_limit: ArrayLike, length: ArrayLike) -> NDArray[np.float64]:
+    """Return the length (m) over which lanes move to their place at each end of a section.
+
+    Examples
+    --------
+    >>> taper_length([5.0, 20.0, 40.0, 40.0], [500.0, 500.0, 500.0, 60.0]).tolist()
+    [20.0, 50.0, 80.0, 30.0]
+    """
+    wanted = np.clip(np.asarray(speed_limit, float) * _TAPER_SECONDS, *_TAPER_LENGTHS)
+    return np.minimum(wanted, np.asarray(length, float) / 2.0)
+
+
+def fade(t: ArrayLike) -> NDArray[np.float64]:
+    """Step smoothly from 1 at 0 to 0 at 1.
+
+    Examples
+    --------
+    >>> fade([-1.0, 0.0, 0.5, 1.0]).tolist()
+    [1.0, 1.0, 0.5, 0.0]
+    """
+    x = np.clip(np.asarray(t, float), 0.0, 1.0)
+    return np.asarray(1.0 - x * x * (3.0 - 2.0 * x))
