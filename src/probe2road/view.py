@@ -41,6 +41,7 @@ logger = logging.getLogger(__name__)
 _WEB_MERCATOR = CRS.from_epsg(3857)
 _MAPLIBRE = "_vendor/maplibre-gl-5.24.1"
 _LARGEST_IMAGE = 4096  # pixels of the longer side; a texture that every graphics card takes
+_MARGIN = 50.0  # m around the traces in which semantic points are shown
 _FAR = 4  # pixels of the image for close views in one of the image for far views
 _MERCATOR_PER_PIXEL = 40075016.686 / 512  # Web Mercator metres per screen pixel at zoom 0
 _DECIMALS = 7  # of a degree: 1 cm
@@ -163,7 +164,7 @@ def _bounds(graph: RoadGraph, fleet: Fleet | None) -> list[float]:
 def _edge_table(graph: RoadGraph) -> gpd.GeoDataFrame:
     """Return the edges without the columns that have no value, numbers at a sensible length."""
     edges = graph.edges.reset_index().drop(columns="key")
-    edges = edges.drop(columns=[name for name in edges if edges[name].isna().all()])
+    edges = edges.drop(columns=[name for name in edges if name != "geometry" and edges[name].isna().all()])
     return edges.round(dict.fromkeys((name for name in edges if pd.api.types.is_float_dtype(edges[name].dtype)), 3))
 
 
@@ -253,7 +254,7 @@ def _densities(fleet: Fleet, resolution: float) -> list[dict[str, Any]]:
     _, lat = transform([(left + right) / 2], [(bottom + top) / 2], fleet.crs, WGS84)
     stretch = float(1 / np.cos(np.radians(lat[0])))  # of Web Mercator against the ground
     mercator = fleet.to_crs(_WEB_MERCATOR)
-    grid = _image_grid(mercator.bounds, resolution * stretch)
+    grid = _image_grid(mercator.bounds, resolution * stretch, _MARGIN * stretch)
     limits = TraceGaps()
     gaps = TraceGaps(max_step=limits.max_step * stretch, max_speed=limits.max_speed * stretch)
     counts = rasterize(mercator, grid, gaps=gaps)
@@ -275,11 +276,11 @@ def _densities(fleet: Fleet, resolution: float) -> list[dict[str, Any]]:
     ]
 
 
-def _image_grid(bounds: tuple[float, float, float, float], resolution: float) -> Grid:
+def _image_grid(bounds: tuple[float, float, float, float], resolution: float, margin: float) -> Grid:
     """Return a grid of whole far pixels that no image is too large for."""
     left, bottom, right, top = bounds
-    coarsest = max(right - left, top - bottom) / (_LARGEST_IMAGE - 2 * _FAR)
-    grid = Grid.from_bounds(bounds, resolution=max(resolution, coarsest), crs=_WEB_MERCATOR)
+    coarsest = (max(right - left, top - bottom) + 2 * margin) / (_LARGEST_IMAGE - 2 * _FAR)
+    grid = Grid.from_bounds(bounds, resolution=max(resolution, coarsest), crs=_WEB_MERCATOR, margin=margin)
     return grid.window(0, 0, -(-grid.rows // _FAR) * _FAR, -(-grid.cols // _FAR) * _FAR)
 
 
