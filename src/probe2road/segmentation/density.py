@@ -3,11 +3,16 @@
 Strategy
 --------
 Traces blur into a kernel density. A threshold on it alone either loses lightly driven roads or lets busy ones
-bloom until they swallow their neighbours, so a pixel must also lie on a ridge: the density has to curve
-downwards across the road, measured by the most negative eigenvalue of its Hessian relative to the density
-itself. That ratio does not depend on how many vehicles drove, only on where the pixel lies in the bundle of
-their traces: at the middle of a bundle of spread s seen with bandwidth b it is b^2 / (b^2 + s^2), and it falls
-to zero at the distance sqrt(b^2 + s^2) from it.
+bloom until they swallow their neighbours. Three things make it safe, and the probability is the least of them:
+
+* evidence: enough traces. Counts enter as log2(1 + count), so that a busy road outweighs the quiet one that
+  meets it by a few times, not by hundreds, and a single trace still counts as one.
+* a ridge: the density has to curve downwards across the road, measured by the most negative eigenvalue of its
+  Hessian relative to the density itself. That ratio does not depend on how many vehicles drove, only on where
+  the pixel lies in the bundle of their traces: at the middle of a bundle of spread s seen with bandwidth b it
+  is b^2 / (b^2 + s^2), and it falls to zero at the distance sqrt(b^2 + s^2) from it.
+* presence: traces close by, at a third of the bandwidth. Outside the corner of a busy road the tail of the
+  density is a ridge too, but nobody drove there.
 
 The bandwidth decides which traces are one road. It is taken from the data: a ladder of bandwidths is climbed
 until the network stops falling apart into single traces, which shows as the length of all ridges no longer
@@ -37,6 +42,7 @@ __all__ = ["DensityOptions", "density_probability", "density_segmenter", "estima
 logger = logging.getLogger(__name__)
 
 _TRUNCATE = 4.5  # kernel half-width, bandwidths; a shorter one ends in a step that curves like a ridge
+_CLOSE_BY = 1 / 3  # bandwidths
 _LADDER = (3.0, 3.75, 4.7, 5.9, 7.3, 9.1, 11.4)  # m, each a quarter more than the one before
 _SETTLED = 1.05  # ridge length over that of the next rung, below which the network holds together
 _COMFORT = 1.5  # bandwidth used over the finest that holds the network together
@@ -50,6 +56,7 @@ class DensityOptions:
 
     bandwidth: float | None = None  # m, Gaussian sigma; estimated from the data where None
     half_evidence: float = 1.0  # traces on a ridge at which the probability is one half
+    half_presence: float = 0.3  # traces close by at which it is one half
     half_ridge: float = 0.3  # relative curvature at which it is one half
     threshold: float = 0.5  # probability that continues a road
     seed_threshold: float = 0.67  # probability that starts one: two traces on a ridge
@@ -137,13 +144,18 @@ def density_probability(trace_counts: NDArray[np.uint32], grid: Grid, options: D
     >>> grid = Grid.from_bounds((1000, 0, 1040.5, 40.5), crs="EPSG:32616")
     >>> probability = density_probability(counts, grid, DensityOptions(bandwidth=3.0))
     >>> probability[[20, 10], 20].tolist()
-    [0.83..., 0.0]
+    [0.72..., 0.0]
     """
     if options.bandwidth is None:
         raise OptionError("no bandwidth", where="DensityOptions", fix="set one, or use density_segmenter")
     sigma = options.bandwidth / grid.resolution
-    density = ndimage.gaussian_filter(trace_counts.astype(np.float32), sigma, mode="constant", truncate=_TRUNCATE)
-    return _ridge_probability(density, sigma, options.half_evidence, options.half_ridge)
+    weight = np.log2(1.0 + trace_counts).astype(np.float32)
+    evidence, presence = (
+        # On the scale of traces: a single straight one has 1 on its line.
+        ndimage.gaussian_filter(weight * np.float32(s * np.sqrt(2 * np.pi)), s, mode="constant", truncate=_TRUNCATE)
+        for s in (sigma, sigma * _CLOSE_BY)
+    )
+    return _least(evidence, presence, sigma, options.half_evidence, options.half_presence, options.half_ridge)
 
 
 def estimate_bandwidth(
@@ -151,9 +163,9 @@ def estimate_bandwidth(
 ) -> float:
     """Return a bandwidth (m) at which the network does not fall apart into single traces.
 
-    Measured on the windows with the most traffic: one and a half times the finest bandwidth of a ladder whose
-    next rung shortens the network by less than a twentieth. The order and the direction of the traces do not
-    matter, nor do changes too small to move the result to another rung.
+    Measured on the windows with the most traffic: one and a half times the rung of a ladder from which on
+    coarser rungs shorten the network by less than a twentieth each. The order and the direction of the traces
+    do not matter, nor do changes too small to move the result to another rung.
 
     Returns
     -------
@@ -166,15 +178,12 @@ def estimate_bandwidth(
     busiest = set(sorted(traffic, key=lambda window: (-traffic[window], window.row, window.col))[:_SAMPLE_WINDOWS])
     windows = rasterize_windows(fleet, grid, size=size, gaps=gaps)
     samples = [counts[0] for window, counts in windows if window in busiest]
-    finest, length = _LADDER[0], _ridge_length(samples, grid, replace(options, bandwidth=_LADDER[0]))
-    for coarser in _LADDER[1:]:
-        shorter = _ridge_length(samples, grid, replace(options, bandwidth=coarser))
-        if length < _SETTLED * shorter:
-            break
-        finest, length = coarser, shorter
-    bandwidth = _COMFORT * finest
-    logger.info("bandwidth %.1f m: ridges settle at %.1f m", bandwidth, finest)
-    return bandwidth
+    everywhere = replace(options, half_presence=0.0)
+    lengths = np.array([_ridge_length(samples, grid, replace(everywhere, bandwidth=rung)) for rung in _LADDER])
+    falling = np.flatnonzero(lengths[:-1] >= _SETTLED * lengths[1:])
+    finest = _LADDER[falling[-1] + 1] if falling.size else _LADDER[0]
+    logger.info("bandwidth %.1f m: ridges settle at %.1f m", _COMFORT * finest, finest)
+    return _COMFORT * finest
 
 
 def _ridge_length(samples: list[NDArray[np.uint32]], grid: Grid, options: DensityOptions) -> int:
@@ -189,30 +198,30 @@ def _halo(bandwidth: float, grid: Grid) -> int:
 
 
 @njit(cache=True)
-def _ridge_probability(
-    density: NDArray[np.float32], sigma: float, half_evidence: float, half_ridge: float
+def _least(
+    evidence: NDArray[np.float32],
+    presence: NDArray[np.float32],
+    sigma: float,
+    half_evidence: float,
+    half_presence: float,
+    half_ridge: float,
 ) -> NDArray[np.float32]:
-    """Probability ``(rows, cols)`` from density ``(rows, cols)``; the outermost pixels stay 0.
-
-    The evidence is the density on the scale of traces: a single straight trace has 1 on its line.
-    """
-    rows, cols = density.shape
+    """Probability ``(rows, cols)``: the least of evidence, presence and ridge; the outermost pixels stay 0."""
+    rows, cols = evidence.shape
     probability = np.zeros((rows, cols), np.float32)
-    to_traces = sigma * np.sqrt(2.0 * np.pi)
     for r in range(1, rows - 1):
         for c in range(1, cols - 1):
-            here = density[r, c]
-            if here <= 0.0:
+            here, close = evidence[r, c], presence[r, c]
+            if here <= 0.0 or close <= 0.0:
                 continue
-            d_rr = density[r + 1, c] - 2.0 * here + density[r - 1, c]
-            d_cc = density[r, c + 1] - 2.0 * here + density[r, c - 1]
+            d_rr = evidence[r + 1, c] - 2.0 * here + evidence[r - 1, c]
+            d_cc = evidence[r, c + 1] - 2.0 * here + evidence[r, c - 1]
             d_rc = 0.25 * (
-                density[r + 1, c + 1] - density[r + 1, c - 1] - density[r - 1, c + 1] + density[r - 1, c - 1]
+                evidence[r + 1, c + 1] - evidence[r + 1, c - 1] - evidence[r - 1, c + 1] + evidence[r - 1, c - 1]
             )
             across = 0.5 * (d_rr + d_cc) - np.sqrt(0.25 * (d_rr - d_cc) ** 2 + d_rc**2)
-            ridge = -across * sigma * sigma / here
-            if ridge <= 0.0:
-                continue
-            evidence = here * to_traces
-            probability[r, c] = min(evidence / (evidence + half_evidence), 0.5 * ridge / half_ridge)
+            ridge = max(0.0, -across * sigma * sigma / here)
+            probability[r, c] = min(
+                here / (here + half_evidence), close / (close + half_presence), 0.5 * ridge / half_ridge
+            )
     return probability
