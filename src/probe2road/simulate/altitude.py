@@ -49,7 +49,7 @@ class HeightOptions:
     grade_tolerance: float = 0.005  # rise over run by which a grade may pass its limit before it is listed
     vertical_radius: float = 400.0  # m; a grade changes at most this fast: 1 / radius for each metre
     lift: float = 30.0  # weight of the terrain below which an open road is kept from sinking, relative to rising
-    max_steps: int = 40  # Newton steps
+    max_steps: int = 60  # Newton steps
     raised_pull: float = 0.05  # weight of the terrain under bridges and tunnels, relative to open road
 
 
@@ -321,9 +321,9 @@ def _rows(columns: list[NDArray[np.int64]], values: list[NDArray[np.float64]], s
     return sparse.csr_array((np.concatenate(values), (row, np.concatenate(columns))), shape=(count, size))
 
 
-_CLEAR_WEIGHT = 1e7  # per m of missing clearance, squared
+_CLEAR_WEIGHT = 3e7  # per m of missing clearance, squared
 _DOUBTFUL_WEIGHT = 1e4  # the same where the order is ambiguous
-_STEEP_WEIGHT = 3e4  # per m of rise beyond the limit, squared
+_STEEP_WEIGHT = 1e5  # per m of rise beyond the limit, squared
 _FULL_STEPS = 12
 _SETTLED = 1e-3  # m; the steps end when no height moves more
 _BEND_FACTOR = 30.0  # bends beyond the limit weigh this much more than those within

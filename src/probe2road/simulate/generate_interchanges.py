@@ -65,12 +65,11 @@ def _diamond(rng: np.random.Generator) -> list[Road]:
         pieces, exits, entries = carriageway(
             path, lanes=lanes, exits=[(half - reach, 180.0)], entries=[(half + reach, 220.0)]
         )
-        heading = 0.0 if side < 0 else np.pi
-        arrival = Pose(float(terminal[0]), float(terminal[1]), heading + np.radians(-62.0))
-        departure = Pose(float(terminal[0]), float(terminal[1]), heading + np.radians(62.0))
+        # Ramps meet the crossing road squarely.
+        facing = Pose(float(terminal[0]), float(terminal[1]), angle + side * np.pi / 2)
         roads += pieces
-        roads.append(ramp(hermite(exits[0].lane, arrival, stretch=0.8), exits[0]))
-        roads.append(ramp(hermite(departure, entries[0].lane, stretch=0.8), None, entries[0]))
+        roads.append(ramp(hermite(exits[0].lane, facing), exits[0]))
+        roads.append(ramp(hermite(facing, entries[0].lane), None, entries[0]))
     return roads if over else [_raised(road) for road in roads]
 
 
@@ -112,8 +111,8 @@ def _cloverleaf(rng: np.random.Generator) -> list[Road]:
 
 
 def _stack(rng: np.random.Generator) -> list[Road]:
-    half, gap, radius = 1500.0, rng.uniform(10, 14), rng.uniform(130, 170)
-    far, beside = rng.uniform(620, 700), rng.uniform(22, 26)  # m, beside: from the outer lane to the left-turn ramp
+    half, gap, radius = 1700.0, rng.uniform(10, 13), rng.uniform(160, 190)
+    far, beside = rng.uniform(740, 820), rng.uniform(15, 18)  # m, beside: from the outer lane to the left-turn ramp
     outer = far + 260.0
     roads: list[Road] = []
     exits: list[list[Gore]] = []
@@ -134,7 +133,11 @@ def _stack(rng: np.random.Generator) -> list[Road]:
         left, right = (quarter + 1) % 4, (quarter + 3) % 4
         leave, join = exits[quarter][1], entries[left][0]
         a, b = leave.lane.moved(200.0, beside), join.lane.moved(-200.0, beside)
-        path = np.concatenate([hermite(leave.lane, a), dubins(a, b, radius=radius, word="LL"), hermite(b, join.lane)])
+        # Straight on beside the motorway, once around the corner where both directions meet, straight on again.
+        c, s = np.cos(a.heading), np.sin(a.heading)
+        ahead = (b.x - a.x) * c + (b.y - a.y) * s
+        turn = dubins(a.moved(ahead - radius), b.moved(radius - ahead), radius=radius, word="LL")
+        path = np.concatenate([hermite(leave.lane, a), turn, hermite(b, join.lane)])
         roads.append(ramp(_joined(path), leave, join, speed=_FAST_RAMP, level=2 + quarter % 2))
         path = hermite(exits[quarter][0].lane, entries[right][1].lane)
         roads.append(ramp(path, exits[quarter][0], entries[right][1], speed=_FAST_RAMP))

@@ -101,8 +101,11 @@ def carriageway(
     spans = [(max(s - aux, 0.0), s) for s, aux in exits if aux] + [
         (s, min(s + aux, total)) for s, aux in entries if aux
     ]
-    gores = {s: any(s in span for span in spans) for s, _ in (*exits, *entries)}
-    cuts = sorted({0.0, total, *gores, *(s for span in spans for s in span)})
+    at_gores = [s for s, _ in (*exits, *entries)]
+    snap = _snapped([0.0, *at_gores, total, *(s for span in spans for s in span)])
+    spans = [(snap[low], snap[high]) for low, high in spans]
+    gores = {snap[s]: any(snap[s] in span for span in spans) for s in at_gores}
+    cuts = sorted(set(snap.values()))
     roads = []
     for begin, end in pairwise(cuts):
         extra = int(any(low <= begin and end <= high for low, high in spans))
@@ -117,7 +120,7 @@ def carriageway(
     out: list[list[Gore]] = []
     for events in (exits, entries):
         out.append([])
-        for at, _ in events:
+        for at in (snap[s] for s, _ in events):
             extra = int(gores[at])
             lateral = (lanes - 1) * width / 2 + extra * width
             out[-1].append(Gore(along(path, at, right=lateral), lateral - extra * width / 2))
@@ -244,6 +247,16 @@ def _cut_structure(road: Road, line: shapely.LineString, spans: list[tuple[float
         part = shapely.get_coordinates(ops.substring(line, begin, end))
         pieces.append(replace(road, line=part, bridge=flag and road.level > 0, tunnel=flag and road.level < 0))
     return pieces
+
+
+def _snapped(distances: Sequence[float]) -> dict[float, float]:
+    """Map distances to themselves, those within a metre of the one before to that one."""
+    snapped: dict[float, float] = {}
+    last = -np.inf
+    for s in sorted(distances):
+        last = s if s > last + 1.0 else last
+        snapped[s] = float(last)
+    return snapped
 
 
 def _between(path: Path, begin: float, end: float) -> Path:

@@ -61,11 +61,10 @@ def _travel_lanes(network: RoadNetwork) -> pd.DataFrame:
 
 
 def _place(moves: pd.DataFrame, *, host: str, guest: str, end: str, lone_right: bool) -> pd.DataFrame:
-    """Spread the guests of each host from its left to its right edge, in the order of their headings."""
+    """Spread the guests of each host from its left to its right edge, in the order of their turns."""
     key = [f"{host}_section", f"{host}_direction", "via_node"]
-    # A ramp that bends to the right leaves on the right; one that arrives bending to the right comes from the left.
-    order = moves["turn"] if end == "start" else -moves["turn"]
-    groups = moves.assign(order=order).groupby(key)["order"]
+    # To the right leaves what turns right at the node; from the right comes what has to turn right to go on.
+    groups = moves.groupby(key)["turn"]
     rank, size = groups.rank(method="first") - 1.0, groups.transform("size")
     share = np.where(size > 1, rank / np.maximum(size - 1.0, 1.0), float(lone_right))
     left, right, step = (moves[f"{host}_{name}"].to_numpy() for name in ("left", "right", "width"))
