@@ -11,12 +11,12 @@ import logging
 import numpy as np
 
 from probe2road.errors import OptionError
-from probe2road.simulate.altitude import HeightOptions
 from probe2road.simulate.generate_corridors import draw_corridor
 from probe2road.simulate.generate_interchanges import DRAWINGS, draw_overpass
 from probe2road.simulate.generate_roads import Road, finish
 from probe2road.simulate.generate_towns import draw_town
 from probe2road.simulate.network import DRIVING_SIDES, RoadNetwork
+from probe2road.simulate.profile import HeightOptions
 
 __all__ = ["INTERCHANGES", "generate_corridor", "generate_interchange", "generate_town"]
 

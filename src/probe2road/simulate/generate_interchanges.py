@@ -22,7 +22,7 @@ from probe2road.simulate.generate_curves import (
     resample,
 )
 from probe2road.simulate.generate_roads import Gore, Road, carriageway, ramp, split_at
-from probe2road.simulate.network import CLASS_DEFAULTS
+from probe2road.simulate.road_classes import CLASS_DEFAULTS
 
 __all__ = ["DRAWINGS", "divided", "draw_overpass"]
 

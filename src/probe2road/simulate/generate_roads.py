@@ -23,10 +23,12 @@ import shapely
 from numpy.typing import NDArray
 from shapely import ops
 
-from probe2road.simulate.altitude import HeightOptions, solve_heights
+from probe2road.simulate.altitude import solve_heights
 from probe2road.simulate.generate_curves import Path, Pose, along, offset_path, path_length, resample
 from probe2road.simulate.lanes import fade, taper_length
-from probe2road.simulate.network import CLASS_DEFAULTS, RoadNetwork, network_from_sections
+from probe2road.simulate.network import RoadNetwork, network_from_sections
+from probe2road.simulate.profile import HeightOptions
+from probe2road.simulate.road_classes import CLASS_DEFAULTS
 
 __all__ = ["Gore", "Road", "carriageway", "finish", "ramp", "split_at"]
 

@@ -23,8 +23,10 @@ import shapely
 
 from probe2road.crs import WGS84, local_crs, parse_crs, require_metric, transform
 from probe2road.errors import InputError
-from probe2road.simulate.altitude import HeightOptions, solve_heights
-from probe2road.simulate.network import CLASS_DEFAULTS, NetworkReport, RoadNetwork, network_from_sections
+from probe2road.simulate.altitude import solve_heights
+from probe2road.simulate.network import NetworkReport, RoadNetwork, network_from_sections
+from probe2road.simulate.profile import HeightOptions
+from probe2road.simulate.road_classes import CLASS_DEFAULTS
 
 __all__ = ["DRIVABLE", "read_network"]
 
