@@ -159,7 +159,7 @@ def write_raster(
         "height": grid.rows,
         "width": grid.cols,
         "crs": grid.crs.to_wkt(),
-        "transform": rasterio.transform.from_origin(grid.left, grid.top, grid.resolution, grid.resolution),
+        "transform": rasterio.Affine(grid.resolution, 0.0, grid.left, 0.0, -grid.resolution, grid.top),
         "compress": "zstd",
         "tiled": True,
         "nodata": nodata,

@@ -73,7 +73,7 @@ def skeletonize(mask: NDArray[Any], *, method: Method = "guo_hall") -> NDArray[n
     state = _padded_state(mask, 0, 0, *_shape_of(mask), halo=0)
     iterations = _thin(state, _deletion_table(method), _NO_LIMIT, 0)
     skeleton = (state[1:-1, 1:-1] & _SET).astype(bool)
-    logger.info("thinned a mask of %d x %d pixels in %d iterations", *skeleton.shape, iterations)
+    logger.debug("thinned a mask of %d x %d pixels in %d iterations", *skeleton.shape, iterations)
     return skeleton
 
 

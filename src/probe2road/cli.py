@@ -1,0 +1,302 @@
+"""The command line: every verb reads files, calls one function of the library, and writes files."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from probe2road.errors import OptionError, OutputError, Probe2RoadError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from probe2road.build import Progress
+    from probe2road.fleet import Fleet
+
+__all__ = ["app", "main"]
+
+logger = logging.getLogger("probe2road")
+
+app = typer.Typer(
+    name="probe2road",
+    help="Road graphs from fleet GNSS traces and camera-detected road features.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+# Options that several verbs share.
+Columns = Annotated[
+    str | None, typer.Option(help="Columns of the traces, ours=theirs: trace_id=trip,t=time,x=lon,y=lat,z=alt.")
+]
+PointColumns = Annotated[str | None, typer.Option(help="Columns of the semantic points, likewise; also kind=label.")]
+Crs = Annotated[str | None, typer.Option(help="CRS of the coordinates, for example EPSG:32616.")]
+Bbox = Annotated[str | None, typer.Option(help="Only this area: left,bottom,right,top in the CRS of the file.")]
+Delimiter = Annotated[str | None, typer.Option(help="Of text tables; told from the first line without it.")]
+NoHeader = Annotated[bool, typer.Option("--no-header", help="Text tables have no line of names: columns are 0, 1, 2.")]
+
+
+@app.callback()
+def _common(
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say more, and show tracebacks.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only warnings and errors.")] = False,
+) -> None:
+    """Set up the log, which goes to standard error."""
+    from rich.console import Console
+    from rich.logging import RichHandler
+
+    level = logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO
+    handler = RichHandler(console=Console(stderr=True), show_path=False, log_time_format="%H:%M:%S", markup=False)
+    logger.handlers[:] = [handler]
+    logger.setLevel(level)
+    logger.propagate = False
+
+
+@app.command()
+def build(
+    traces: Annotated[list[Path], typer.Argument(help="Files or folders: Parquet, GeoParquet, CSV, GPX.")],
+    output: Annotated[
+        list[Path], typer.Option("--output", "-o", help="Graph to write; the suffix decides. May be repeated.")
+    ],
+    points: Annotated[Path | None, typer.Option(help="Semantic points: a file or a folder.")] = None,
+    columns: Columns = None,
+    point_columns: PointColumns = None,
+    crs: Crs = None,
+    bbox: Bbox = None,
+    delimiter: Delimiter = None,
+    no_header: NoHeader = False,
+    segmenter: Annotated[str | None, typer.Option(help="density: needs no weights.")] = None,
+    resolution: Annotated[float | None, typer.Option(help="Metres per pixel.")] = None,
+    work_crs: Annotated[
+        str | None, typer.Option(help="Metric CRS to work in; chosen from the data without it.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file with build options.")] = None,
+    keep_intermediate: Annotated[
+        Path | None, typer.Option(help="Folder that keeps what every stage made, and a picture of it.")
+    ] = None,
+) -> None:
+    """Build a road graph from fleet data.
+
+    An interrupted run goes on where it stopped when it is started again.
+    """
+    from probe2road.build import BuildOptions
+    from probe2road.build import build as build_graph
+    from probe2road.export import graph_format, write_graph
+    from probe2road.options import load_options
+
+    for path in output:
+        graph_format(path)
+        if not path.parent.is_dir():
+            raise OutputError(f"folder {path.parent} does not exist", where=path, fix="create it first")
+    options = load_options(config, BuildOptions) if config else BuildOptions()
+    chosen: dict[str, Any] = {"segmenter": segmenter, "resolution": resolution}
+    options = replace(options, **{name: value for name, value in chosen.items() if value is not None})
+
+    fleet = _read_fleet(traces, points, columns, point_columns, crs, bbox, delimiter, no_header, work_crs)
+    workspace = keep_intermediate or output[0].parent / f".{output[0].name}.probe2road"
+    with _progress_bar() as progress:
+        graph = build_graph(fleet, options, workspace=workspace, progress=progress)
+    for path in output:
+        write_graph(graph, path)
+    if keep_intermediate:
+        from probe2road.picture import write_filmstrip
+
+        write_filmstrip(keep_intermediate, keep_intermediate / "stages.png", fleet=fleet)
+    else:
+        shutil.rmtree(workspace, ignore_errors=True)
+
+
+@app.command()
+def evaluate(
+    proposal: Annotated[Path, typer.Argument(help="Road graph to score.")],
+    reference: Annotated[Path, typer.Argument(help="Road graph to score against.")],
+    metrics: Annotated[
+        str | None, typer.Option(help="Comma-separated: geo, itopo, topo, apls, buffer_geo, ...")
+    ] = None,
+    area: Annotated[str | None, typer.Option(help="Clip both to left,bottom,right,top in the reference's CRS.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="CSV file for the scores.")] = None,
+) -> None:
+    """Score a road graph against a reference; both may be in any format that build writes, or OSM."""
+    from probe2road.export import read_graph
+    from probe2road.io.atomic import atomic_path
+    from probe2road.metrics import DEFAULT_METRICS
+    from probe2road.metrics import evaluate as score
+
+    target = read_graph(reference)
+    names = metrics.split(",") if metrics else DEFAULT_METRICS
+    scores = score(read_graph(proposal), target, metrics=names, area=_numbers(area, "--area") if area else None)
+    if output:
+        with atomic_path(output) as temporary:
+            scores.to_csv(temporary, index=False)
+    _print_scores(scores)
+
+
+@app.command()
+def info(
+    file: Annotated[Path, typer.Argument(help="Fleet data or a road graph.")],
+    columns: Columns = None,
+    crs: Crs = None,
+    bbox: Bbox = None,
+    delimiter: Delimiter = None,
+    no_header: NoHeader = False,
+) -> None:
+    """Describe fleet data or a road graph in figures."""
+    from probe2road.describe import describe_file
+
+    figures = describe_file(
+        file,
+        columns=_column_map(columns, "--columns"),
+        crs=crs,
+        bbox=_numbers(bbox, "--bbox") if bbox else None,
+        delimiter=delimiter,
+        header=not no_header,
+    )
+    typer.echo(json.dumps(figures, indent=1))
+
+
+@app.command()
+def view(
+    graph: Annotated[Path, typer.Argument(help="Road graph.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="HTML file, or PNG.")],
+    traces: Annotated[Path | None, typer.Option(help="Fleet data to show under it.")] = None,
+    points: Annotated[Path | None, typer.Option(help="Semantic points to show under it.")] = None,
+    reference: Annotated[Path | None, typer.Option(help="Road graph to compare with, in a PNG.")] = None,
+    title: Annotated[str | None, typer.Option(help="Heading; the file's name without it.")] = None,
+    columns: Columns = None,
+    point_columns: PointColumns = None,
+    crs: Crs = None,
+    delimiter: Delimiter = None,
+    no_header: NoHeader = False,
+) -> None:
+    """Draw a road graph over its traces: one HTML page that needs no network, or a picture."""
+    from probe2road.export import read_graph
+    from probe2road.picture import draw_graph
+    from probe2road.view import write_view
+
+    if output.suffix.lower() not in (".html", ".htm", ".png"):
+        raise OptionError(f"cannot draw {output.suffix or 'no suffix'}", where=output, fix="use .html or .png")
+    roads = read_graph(graph)
+    fleet = None
+    if traces:
+        fleet = _read_fleet(
+            [traces], points, columns, point_columns, crs, None, delimiter, no_header, roads.crs.to_wkt()
+        )
+    if output.suffix.lower() == ".png":
+        draw_graph(roads, output, fleet=fleet, reference=read_graph(reference) if reference else None)
+    else:
+        write_view(roads, output, traces=fleet, title=title or graph.name)
+
+
+@app.command()
+def demo(
+    folder: Annotated[Path, typer.Argument(help="Folder to write to.")] = Path("demo-output"),
+) -> None:
+    """Run the main job on a simulated cloverleaf, offline, and say which files to open."""
+    from probe2road.demo import run_demo
+
+    with _progress_bar() as progress:
+        files, scores = run_demo(folder, progress=progress)
+    _print_scores(scores)
+    typer.echo("\nOpen these:")
+    for path, what in files.items():
+        typer.echo(f"  {path}  {what}")
+
+
+def main() -> None:
+    """Run the command line; an error of ours is one message and exit code 2."""
+    try:
+        app(standalone_mode=True)
+    except Probe2RoadError as error:
+        if logger.isEnabledFor(logging.DEBUG):
+            raise
+        typer.secho(f"error: {error}", fg="red", err=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        typer.secho("interrupted; start again to go on", err=True)
+        sys.exit(130)
+
+
+def _read_fleet(
+    traces: list[Path],
+    points: Path | None,
+    columns: str | None,
+    point_columns: str | None,
+    crs: str | None,
+    bbox: str | None,
+    delimiter: str | None,
+    no_header: bool,
+    work_crs: str | None,
+) -> Fleet:
+    from probe2road.io.fleet_reader import read_fleet
+
+    box = _numbers(bbox, "--bbox") if bbox else None
+    return read_fleet(
+        traces[0] if len(traces) == 1 else traces,
+        points,
+        columns=_column_map(columns, "--columns"),
+        point_columns=_column_map(point_columns, "--point-columns"),
+        crs=crs,
+        target_crs=work_crs,
+        bbox=box,
+        delimiter=delimiter,
+        header=not no_header,
+    )
+
+
+def _column_map(text: str | None, option: str) -> dict[str, str]:
+    """Read ``ours=theirs,ours=theirs``."""
+    if not text:
+        return {}
+    pairs = [pair.partition("=") for pair in text.split(",")]
+    if bad := [name for name, equals, _ in pairs if not equals]:
+        raise OptionError(f"{bad[0]!r} has no =", where=option, fix="write ours=theirs, for example trace_id=trip")
+    return {name.strip(): theirs.strip() for name, _, theirs in pairs}
+
+
+def _numbers(text: str, option: str) -> tuple[float, float, float, float]:
+    """Read ``left,bottom,right,top``."""
+    try:
+        left, bottom, right, top = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise OptionError(f"{text!r} is not left,bottom,right,top", where=option) from error
+    return left, bottom, right, top
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Progress]:
+    """Show how far the current stage is, on standard error and only on a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    console = Console(stderr=True)
+    parts: list[Any] = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
+    with Bar(*parts, console=console, transient=True, disable=not console.is_terminal) as bar:
+        tasks: dict[str, Any] = {}
+
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total)
+
+        yield report
+
+
+def _print_scores(scores: pd.DataFrame) -> None:
+    """Print scores as a table, each with its parameters."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("metric", "precision", "recall", "F1", "parameters", box=None)
+    for row in scores.itertuples():
+        table.add_row(row.metric, f"{row.precision:.3f}", f"{row.recall:.3f}", f"{row.f1:.3f}", row.parameters)
+    Console().print(table)

@@ -1,0 +1,72 @@
+"""Stage options from TOML: what a file may set is exactly what the dataclasses declare."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_type_hints
+
+from probe2road.errors import OptionError
+
+__all__ = ["load_options", "options_from_table"]
+
+T = TypeVar("T")
+
+
+def load_options(path: str | Path, kind: type[T]) -> T:
+    """Read options of a dataclass from a TOML file; nested dataclasses are tables.
+
+    Raises
+    ------
+    OptionError
+        If the file cannot be read, is not TOML, or sets something the dataclass does not have.
+    """
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise OptionError(f"cannot be read ({error.strerror})", where=path) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise OptionError(f"is not TOML: {error}", where=path) from error
+    return options_from_table(table, kind, where=path)
+
+
+def options_from_table(table: dict[str, Any], kind: type[T], *, where: object = None) -> T:
+    """Build a dataclass from a table of its fields; absent fields keep their defaults.
+
+    Raises
+    ------
+    OptionError
+        Naming an unknown field or a value of the wrong type.
+
+    Examples
+    --------
+    >>> from probe2road.clean import CleanOptions
+    >>> options_from_table({"dead_end": 20}, CleanOptions).dead_end
+    20.0
+    >>> options_from_table({"deadend": 20}, CleanOptions, where="build.toml")
+    Traceback (most recent call last):
+        ...
+    probe2road.errors.OptionError: build.toml: there is no option 'deadend'; use short_edge, max_ring, ...
+    """
+    hints = get_type_hints(kind)
+    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    values = {}
+    for name, value in table.items():
+        if name not in names:
+            raise OptionError(f"there is no option {name!r}", where=where, fix=f"use {', '.join(names)}")
+        values[name] = _converted(value, hints[name], f"{where}: {name}" if where else name)
+    return kind(**values)
+
+
+def _converted(value: Any, hint: Any, where: str) -> Any:
+    """Return the value as its field wants it: tables become dataclasses, whole numbers become floats."""
+    if is_dataclass(hint) and isinstance(value, dict):
+        return options_from_table(value, hint, where=where)  # type: ignore[arg-type]
+    allowed = get_args(hint) or (hint,)
+    if float in allowed and type(value) is int:
+        return float(value)
+    if type(value) not in allowed:
+        expected = " or ".join(getattr(kind, "__name__", str(kind)) for kind in allowed if kind is not type(None))
+        raise OptionError(f"{value!r} is not of type {expected}", where=where)
+    return value

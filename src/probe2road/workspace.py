@@ -1,0 +1,127 @@
+"""What the stages of one run leave behind, so that the next run can go on from there.
+
+A workspace is a folder with one file per stage and the fingerprint of the fleet and options that made them.
+Files are written atomically, so whatever is there is complete. A folder with another fingerprint is emptied
+of its stage files first: stages of two runs never mix.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from probe2road.errors import OutputError
+from probe2road.export import read_graph, write_graph
+from probe2road.fleet import Fleet
+from probe2road.grid import Grid, write_raster
+from probe2road.io.atomic import atomic_path
+from probe2road.roadgraph import RoadGraph
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+__all__ = ["Workspace", "fingerprint", "open_workspace"]
+
+logger = logging.getLogger(__name__)
+
+_MARK = "run.json"
+_FORMAT = 1  # raised when what a stage writes changes
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """A folder for stage files; with no folder, nothing is kept and nothing is found."""
+
+    folder: Path | None
+
+    def write_raster(self, name: str, array: NDArray[Any], grid: Grid) -> None:
+        """Keep a raster as ``NAME.tif``."""
+        if self.folder is not None:
+            write_raster(self.folder / f"{name}.tif", array, grid, names=[name])
+
+    def write_graph(self, name: str, graph: RoadGraph) -> None:
+        """Keep a graph as ``NAME.gpkg``."""
+        if self.folder is not None:
+            write_graph(graph, self.folder / f"{name}.gpkg")
+
+    def read_graph(self, name: str) -> RoadGraph | None:
+        """Return a graph an earlier run kept, or None."""
+        path = None if self.folder is None else self.folder / f"{name}.gpkg"
+        if path is None or not path.exists():
+            return None
+        logger.info("taking %s from an earlier run", path.name)
+        return read_graph(path)
+
+    def write_array(self, name: str, array: NDArray[Any]) -> None:
+        """Keep an array as ``NAME.npy``."""
+        if self.folder is not None:
+            with atomic_path(self.folder / f"{name}.npy") as temporary:
+                np.save(temporary, array)
+
+    def read_array(self, name: str) -> NDArray[Any] | None:
+        """Return an array an earlier run kept, or None."""
+        path = None if self.folder is None else self.folder / f"{name}.npy"
+        return np.load(path) if path is not None and path.exists() else None
+
+
+def open_workspace(folder: str | Path | None, fleet: Fleet, options: DataclassInstance) -> Workspace:
+    """Open the workspace of a run, empty unless it belongs to the same fleet and options.
+
+    Parameters
+    ----------
+    folder
+        Created where it does not exist; None for a workspace that keeps nothing.
+    fleet, options
+        What the run works on.
+
+    Raises
+    ------
+    OutputError
+        If the folder has files in it but is not a workspace, or cannot be created.
+    """
+    if folder is None:
+        return Workspace(None)
+    folder = Path(folder)
+    mark = {"format": _FORMAT, "fleet": fingerprint(fleet), "options": asdict(options)}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot be created ({error.strerror})", where=folder) from error
+    path = folder / _MARK
+    if not path.exists() and any(folder.iterdir()):
+        raise OutputError("the folder is not empty and not a workspace", where=folder, fix="name an empty folder")
+    if path.exists() and json.loads(path.read_text()) != mark:
+        logger.info("%s belongs to another run: starting afresh", folder)
+        for file in folder.iterdir():
+            if file.suffix in (".tif", ".gpkg", ".npy", ".png"):
+                file.unlink()
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(mark, indent=1))
+    return Workspace(folder)
+
+
+def fingerprint(fleet: Fleet) -> str:
+    """Return a digest of everything in a fleet, which equal fleets share.
+
+    Examples
+    --------
+    >>> from probe2road.demo import demo_fleet
+    >>> fingerprint(demo_fleet(n_drives=2)) == fingerprint(demo_fleet(n_drives=2))
+    True
+    >>> fingerprint(demo_fleet(n_drives=2)) == fingerprint(demo_fleet(n_drives=3))
+    False
+    """
+    digest = hashlib.blake2b(fleet.crs.to_wkt().encode(), digest_size=16)
+    for table in (fleet.traces, fleet.points):
+        for name in table:
+            digest.update(name.encode())
+            digest.update(pd.util.hash_pandas_object(table[name], index=False).to_numpy().tobytes())
+    return digest.hexdigest()

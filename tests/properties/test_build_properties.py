@@ -1,0 +1,89 @@
+"""What must not change the graph: the order and direction of the traces, whole-pixel moves, the input's CRS."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import shapely
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from probe2road.build import BuildOptions, build
+from probe2road.crs import parse_crs, transform
+from probe2road.fleet import fleet_from_tables
+from probe2road.segmentation.density import DensityOptions
+
+CRS = "EPSG:32616"
+OPTIONS = BuildOptions(density=DensityOptions(bandwidth=5.0))
+FEW = settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@st.composite
+def tables(draw):
+    """Drives along a few random straight roads, in whole and quarter metres."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    drives = []
+    for road in range(draw(st.integers(1, 4))):
+        start, heading = rng.uniform(0, 400, 2), rng.uniform(0, 2 * np.pi)
+        for number in range(rng.integers(1, 6)):
+            at = np.arange(0, rng.uniform(100, 400), 12.0)
+            x = start[0] + at * np.cos(heading) + rng.normal(0, 1.0)
+            y = start[1] + at * np.sin(heading) + rng.normal(0, 1.0)
+            drives.append(pd.DataFrame({"trace_id": f"{road}/{number}", "t": np.arange(len(at)), "x": x, "y": y}))
+    table = pd.concat(drives, ignore_index=True)
+    return table.assign(x=446000 + (table["x"] * 4).round() / 4, y=4636000 + (table["y"] * 4).round() / 4)
+
+
+def graph_of(table, options=OPTIONS):
+    return build(fleet_from_tables(table, crs=CRS, target_crs=CRS), options)
+
+
+def same(first, second, *, shift=(0.0, 0.0)):
+    assert first.edges[["u", "v", "key"]].to_numpy().tolist() == second.edges[["u", "v", "key"]].to_numpy().tolist()
+    moved = first.edges.geometry.translate(*shift)
+    assert moved.geom_equals_exact(second.edges.geometry, 1e-6).all()
+
+
+@FEW
+@given(tables(), st.randoms(use_true_random=False))
+def test_the_order_of_the_traces_does_not_matter(table, random):
+    names = list(table["trace_id"].unique())
+    shuffled = dict(zip(names, random.sample(names, len(names)), strict=True))
+    same(graph_of(table), graph_of(table.assign(trace_id=table["trace_id"].map(shuffled))))
+
+
+@FEW
+@given(tables(), st.randoms(use_true_random=False))
+def test_the_direction_of_the_traces_does_not_matter(table, random):
+    turned = table.copy()
+    for name in table["trace_id"].unique():
+        if random.random() < 0.5:
+            rows = table["trace_id"] == name
+            turned.loc[rows, "t"] = -table.loc[rows, "t"]
+    same(graph_of(table), graph_of(turned))
+
+
+@FEW
+@given(tables(), st.integers(-500, 500), st.integers(-500, 500))
+def test_moving_the_traces_by_whole_pixels_moves_the_graph(table, east, north):
+    moved = table.assign(x=table["x"] + east, y=table["y"] + north)
+    same(graph_of(table), graph_of(moved), shift=(east, north))
+
+
+@pytest.mark.parametrize("other", ["EPSG:32615", "EPSG:26971", "EPSG:4326"])
+def test_the_crs_that_the_traces_come_in_does_not_matter(other):
+    rng = np.random.default_rng(5)
+    at = np.arange(0, 600, 12.0)
+    table = pd.concat(
+        pd.DataFrame({"trace_id": number, "t": np.arange(50), "x": 446000.3 + at, "y": 4636000 + at / 3 + rng.normal()})
+        for number in range(10)
+    )
+    here = fleet_from_tables(table, crs=CRS, target_crs=CRS)
+    x, y = transform(table["x"].to_numpy(), table["y"].to_numpy(), here.crs, parse_crs(other))
+    there = fleet_from_tables(table.assign(x=x, y=y), crs=other, target_crs=CRS)
+    assert np.abs(here.traces[["x", "y"]].to_numpy() - there.traces[["x", "y"]].to_numpy()).max() < 0.01
+    first = shapely.get_coordinates(build(here, OPTIONS).edges.geometry.segmentize(1.0))
+    second = build(there, OPTIONS).edges.geometry.to_numpy()
+    # A fix that changes pixels moves the graph by centimetres around it, and no farther.
+    apart = shapely.distance(shapely.points(first), shapely.union_all(second))
+    assert np.median(apart) < 0.01
+    assert apart.max() < 0.5

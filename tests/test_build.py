@@ -1,0 +1,137 @@
+import logging
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe2road.build import BuildOptions, build
+from probe2road.errors import InputError, OptionError, OutputError
+from probe2road.export import read_graph
+from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.grid import read_raster
+from probe2road.metrics import evaluate
+from probe2road.roadgraph import check_graph, graph_from_lines
+from probe2road.segmentation.density import DensityOptions
+from probe2road.segmentation.segmenter import Segmenter
+from probe2road.workspace import fingerprint
+
+CRS = "EPSG:32616"
+ORIGIN = np.array([446000.0, 4636000.0])
+CROSS = [[(0, 400), (400, 400)], [(400, 400), (800, 400)], [(400, 0), (400, 400)], [(400, 400), (400, 800)]]
+
+
+def drives(*paths, n=8, noise=1.0, seed=0):
+    """A fleet that drives each path n times, with a lateral offset per drive; a fix every 15 m."""
+    rng = np.random.default_rng(seed)
+    tables = []
+    for number in range(n * len(paths)):
+        path = np.array(paths[number % len(paths)], float)
+        along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+        at = np.arange(0, along[-1], 15.0)
+        x, y = (np.interp(at, along, path[:, axis]) + rng.normal(0, noise) for axis in (0, 1))
+        tables.append(
+            pd.DataFrame({"trace_id": number, "t": np.arange(len(at)), "x": x + ORIGIN[0], "y": y + ORIGIN[1]})
+        )
+    return fleet_from_tables(pd.concat(tables), crs=CRS, target_crs=CRS)
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    return drives([(0, 400), (800, 400)], [(400, 0), (400, 800)])
+
+
+def test_a_crossing_comes_out(crossing):
+    graph = build(crossing)
+    check_graph(graph)
+    assert sorted(graph.degrees()) == [1, 1, 1, 1, 4]
+    reference = graph_from_lines([np.array(line) + ORIGIN for line in CROSS], crs=CRS)
+    scores = evaluate(graph, reference, metrics=["geo"])
+    assert scores["f1"].iloc[0] > 0.9
+    assert graph.edges["score"].between(0.5, 1).all()
+
+
+def test_every_stage_is_kept_on_request(crossing, tmp_path):
+    graph = build(crossing, workspace=tmp_path / "stages")
+    probability, grid = read_raster(tmp_path / "stages" / "1-probability.tif")
+    mask, _ = read_raster(tmp_path / "stages" / "2-mask.tif")
+    skeleton, _ = read_raster(tmp_path / "stages" / "3-skeleton.tif")
+    assert grid.crs == crossing.crs
+    assert 0 < skeleton.sum() < mask.sum() < (probability > 0).sum()
+    kept = read_graph(tmp_path / "stages" / "5-cleaned.gpkg")
+    assert kept.edges.geometry.geom_equals_exact(graph.edges.geometry, 1e-6).all()
+    assert len(read_graph(tmp_path / "stages" / "4-vectorized.gpkg").edges) >= len(kept.edges)
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(crossing, tmp_path, monkeypatch):
+    whole = build(crossing)
+    monkeypatch.setattr("probe2road.build._WINDOW", 256)
+    original, predicted = Segmenter.__getattribute__, []
+
+    def stop_after_three(self, name):
+        if name == "predict":
+            if len(predicted) == 3:
+                raise KeyboardInterrupt
+            predicted.append(name)
+        return original(self, name)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Segmenter, "__getattribute__", stop_after_three)
+        with pytest.raises(KeyboardInterrupt):
+            build(crossing, workspace=tmp_path / "work")
+    kept = sorted((tmp_path / "work").glob("window-*.npy"))
+    assert len(kept) == 3
+    before = [file.stat().st_mtime_ns for file in kept]
+    graph = build(crossing, workspace=tmp_path / "work")
+    assert [file.stat().st_mtime_ns for file in kept] == before
+    assert graph.edges.geometry.geom_equals_exact(whole.edges.geometry, 1e-6).all()
+
+
+def test_a_workspace_of_another_run_is_not_mixed_in(crossing, tmp_path, caplog):
+    build(crossing, workspace=tmp_path / "work")
+    with caplog.at_level(logging.INFO):
+        other = build(crossing, BuildOptions(density=DensityOptions(bandwidth=9.0)), workspace=tmp_path / "work")
+    assert "starting afresh" in caplog.text
+    again = build(crossing, BuildOptions(density=DensityOptions(bandwidth=9.0)))
+    assert other.edges.geometry.geom_equals_exact(again.edges.geometry, 1e-6).all()
+
+
+def test_a_folder_with_other_things_in_it_is_left_alone(crossing, tmp_path):
+    (tmp_path / "thesis.tex").write_text("chapter 1")
+    with pytest.raises(OutputError, match="not a workspace"):
+        build(crossing, workspace=tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_progress_is_reported_to_the_end(crossing):
+    told = []
+    build(crossing, progress=lambda *args: told.append(args))
+    assert {stage for stage, _, _ in told} == {"segmentation", "skeleton", "graph"}
+    assert told[-1] == ("graph", 1, 1)
+
+
+def test_a_finer_grid_gives_the_same_roads(crossing):
+    coarse, fine = (build(crossing, BuildOptions(resolution=r)) for r in (1.0, 0.5))
+    assert evaluate(fine, coarse, metrics=["geo"])["f1"].iloc[0] > 0.9
+
+
+def test_a_single_fix_makes_no_road():
+    table = pd.DataFrame({"trace_id": [1], "t": [0], "x": [446000.0], "y": [4636000.0]})
+    graph = build(fleet_from_tables(table, crs=CRS, target_crs=CRS))
+    check_graph(graph)
+    assert graph.edges.empty
+
+
+def test_no_fixes_are_an_error(crossing):
+    with pytest.raises(InputError, match="no fixes"):
+        build(Fleet(crossing.traces.iloc[:0], crossing.points, crossing.crs))
+
+
+def test_an_unknown_segmenter_is_an_error():
+    with pytest.raises(OptionError, match="density"):
+        BuildOptions(segmenter="magic")
+
+
+def test_the_fingerprint_sees_every_change(crossing):
+    moved = Fleet(crossing.traces.assign(x=crossing.traces["x"] + 1e-6), crossing.points, crossing.crs)
+    renamed = Fleet(crossing.traces.assign(trace_id=crossing.traces["trace_id"] + 1), crossing.points, crossing.crs)
+    assert len({fingerprint(fleet) for fleet in (crossing, moved, renamed)}) == 3

@@ -1,0 +1,71 @@
+import numpy as np
+import pytest
+import rasterio
+
+from probe2road.errors import CRSError, InputError, OptionError
+from probe2road.grid import Grid, read_raster, write_raster
+
+CRS = "EPSG:32616"
+
+
+def test_pixels_contain_their_positions():
+    grid = Grid.from_bounds((446000.2, 4636000.7, 446100.9, 4636050.1), resolution=0.5, crs=CRS)
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(446000.2, 446100.9, 500), rng.uniform(4636000.7, 4636050.1, 500)
+    row, col = grid.rowcol(x, y)
+    assert ((row >= 0) & (row < grid.rows) & (col >= 0) & (col < grid.cols)).all()
+    centre_x, centre_y = grid.xy(row, col)
+    assert np.abs(centre_x - x).max() <= 0.25
+    assert np.abs(centre_y - y).max() <= 0.25
+
+
+def test_rows_run_south():
+    grid = Grid.from_bounds((0, 0, 10, 10), crs=CRS)
+    row, _ = grid.rowcol([5, 5], [9.5, 0.5])
+    assert row[0] < row[1]
+
+
+def test_moving_the_data_by_whole_pixels_moves_the_grid():
+    here = Grid.from_bounds((446000.2, 4636000.7, 446100.9, 4636050.1), crs=CRS)
+    there = Grid.from_bounds((446010.2, 4635993.7, 446110.9, 4636043.1), crs=CRS)
+    assert there.shape == here.shape
+    assert (there.left - here.left, there.top - here.top) == (10, -7)
+
+
+def test_a_resolution_must_be_positive():
+    with pytest.raises(OptionError, match="metres per pixel"):
+        Grid.from_bounds((0, 0, 1, 1), resolution=0, crs=CRS)
+
+
+def test_degrees_are_refused():
+    with pytest.raises(CRSError, match="reproject"):
+        Grid.from_bounds((0, 0, 1, 1), crs="EPSG:4326")
+
+
+def test_windows_cover_every_pixel_once():
+    grid = Grid.from_bounds((0, 0, 94, 41), crs=CRS)
+    seen = np.zeros(grid.shape, int)
+    for window in grid.windows(30, halo=4):
+        seen[window.core] += 1
+        padded = np.zeros(window.grid(grid).shape)
+        assert padded[window.inner].shape == (window.rows, window.cols)
+        assert window.grid(grid).xy(4, 4) == pytest.approx(grid.xy(window.row, window.col))
+    assert (seen == 1).all()
+
+
+@pytest.mark.parametrize("dtype", ["uint32", "float32", "bool", "uint8"])
+def test_a_raster_comes_back_from_its_file(tmp_path, dtype):
+    grid = Grid.from_bounds((446000, 4636000, 446099, 4636049), crs=CRS)
+    array = (np.random.default_rng(1).random((2, *grid.shape)) * 9).astype(dtype)
+    write_raster(tmp_path / "counts.tif", array, grid, names=["a", "b"])
+    read, read_grid = read_raster(tmp_path / "counts.tif")
+    np.testing.assert_array_equal(read.astype(dtype), array)
+    assert read_grid == grid
+    with rasterio.open(tmp_path / "counts.tif") as file:
+        assert file.descriptions == ("a", "b")
+
+
+def test_a_raster_that_is_none_is_named(tmp_path):
+    (tmp_path / "noise.tif").write_bytes(b"not a raster")
+    with pytest.raises(InputError, match=r"noise\.tif"):
+        read_raster(tmp_path / "noise.tif")
