@@ -23,7 +23,7 @@ from probe2road.errors import OptionError
 from probe2road.fleet import POINT_KINDS, Fleet
 from probe2road.roadgraph import RoadGraph
 from probe2road.simulate.camera import ROAD_BOUNDARY, Detections, FeatureIndex, feature_index, see
-from probe2road.simulate.features import road_features
+from probe2road.simulate.features import RoadFeatures, road_features
 from probe2road.simulate.gnss import gnss_errors
 from probe2road.simulate.network import RoadNetwork
 from probe2road.simulate.odometry import fuse
@@ -39,6 +39,7 @@ __all__ = [
     "simulate",
     "simulate_chunks",
     "simulate_drive",
+    "visible_features",
 ]
 
 logger = logging.getLogger(__name__)
@@ -260,7 +261,7 @@ def fleet_world(network: RoadNetwork, preset: Preset, *, seed: int) -> FleetWorl
     traffic = traffic_world(network, preset.demand, rng=_stream(seed, _WORLD, 0))
     features = None
     if preset.camera is not None:
-        lines = road_features(network, rng=_stream(seed, _WORLD, 1))
+        lines = visible_features(network, seed=seed)
         kind = (lines.kind == POINT_KINDS[ROAD_BOUNDARY]).astype(np.int8)
         features = feature_index(lines.xyz, lines.offsets, kind, preset.camera)
     return FleetWorld(
@@ -272,6 +273,14 @@ def fleet_world(network: RoadNetwork, preset: Preset, *, seed: int) -> FleetWorl
         network.sections["tunnel"].to_numpy(bool),
         network.sections.index.to_numpy(np.int64),
     )
+
+
+def visible_features(network: RoadNetwork, *, seed: int) -> RoadFeatures:
+    """Return the markings and boundaries that the cameras of a simulated fleet can see.
+
+    ``Detections.feature`` counts in them; the seed decides where boundaries have gaps.
+    """
+    return road_features(network, rng=_stream(seed, _WORLD, 1))
 
 
 def _stream(seed: int, *keys: int) -> np.random.Generator:

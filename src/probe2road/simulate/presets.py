@@ -127,7 +127,7 @@ _CAMERA = CameraModel(
     pitch_noise=0.25,
     pitch_time=0.5,
     yaw_bias=0.15,
-    dash_points=9.0,
+    dash_points=7.8,
     solid_points=0.9,
     boundary_points=0.7,
     range_decay=14.0,
@@ -147,6 +147,8 @@ _CAMERA = CameraModel(
 )
 
 _URBAN = replace(SurroundingsModel(), exposure={"motorway": 0.6, "motorway_link": 0.7, "trunk": 0.8}, spread=0.6)
+# Among tall buildings a filter cannot afford to distrust what it has: it follows further, and worse fixes.
+_URBAN_FUSION = replace(_FUSION, gate=8.0, trusted_sigma=4.0)
 _MIXED_GNSS = replace(_OPEN_SKY, burst_rate=_NAGOYA.burst_rate)
 
 PRESETS: Mapping[str, Preset] = {
@@ -154,7 +156,7 @@ PRESETS: Mapping[str, Preset] = {
     for preset in (
         Preset("open_sky", _OPEN_SKY, _FUSION, _ODOMETRY, _CAMERA),
         Preset("mixed", _MIXED_GNSS, _FUSION, _ODOMETRY, _CAMERA),
-        Preset("urban_canyon", _NAGOYA, _FUSION, _ODOMETRY, _CAMERA, _URBAN),
+        Preset("urban_canyon", _NAGOYA, _URBAN_FUSION, _ODOMETRY, _CAMERA, _URBAN),
         Preset("phone", _NAGOYA, None, _ODOMETRY, None, _URBAN),
     )
 }

@@ -33,7 +33,7 @@ class DriverModel:
     yield_wait: float = 4.0  # s, mean of the exponential wait there
     signal_stop: float = 0.25  # probability of a stop at another junction at grade
     signal_wait: float = 18.0  # s, mean of the exponential wait there
-    lane_bias: float = 0.33  # m, between vehicles: standard deviation of the place held in the lane
+    lane_bias: float = 0.36  # m, between vehicles: standard deviation of the place held in the lane
     wander_sigma: float = 0.22  # m, of the slow weaving of one vehicle
     wander_rate: float = 0.85  # 1/s, of the critically damped process that weaves
     lane_change_time: float = 6.3  # s, mean
