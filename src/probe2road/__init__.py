@@ -11,19 +11,69 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0.dev0"
 
 if TYPE_CHECKING:
-    from probe2road.fleet import Fleet, fleet_from_tables
+    from probe2road.errors import Probe2RoadError
+    from probe2road.export import from_networkx, read_graph, to_networkx, write_graph
+    from probe2road.fleet import Fleet, TraceGaps, fleet_from_tables
+    from probe2road.io.fleet_reader import read_fleet
+    from probe2road.io.fleet_summary import describe_fleet
+    from probe2road.io.fleet_writer import write_fleet
+    from probe2road.metrics.evaluate import evaluate
+    from probe2road.raster import rasterize
+    from probe2road.recipe import BuildOptions, build
+    from probe2road.roadgraph import RoadGraph, check_graph, graph_from_lines
+    from probe2road.view import write_view
 
 _HOME = {
+    "Probe2RoadError": "errors",
     "Fleet": "fleet",
+    "TraceGaps": "fleet",
     "fleet_from_tables": "fleet",
+    "read_fleet": "io.fleet_reader",
+    "write_fleet": "io.fleet_writer",
+    "describe_fleet": "io.fleet_summary",
+    "RoadGraph": "roadgraph",
+    "check_graph": "roadgraph",
+    "graph_from_lines": "roadgraph",
+    "read_graph": "export",
+    "write_graph": "export",
+    "to_networkx": "export",
+    "from_networkx": "export",
+    "rasterize": "raster",
+    "BuildOptions": "recipe",
+    "build": "recipe",
+    "evaluate": "metrics.evaluate",
+    "write_view": "view",
 }
 
-__all__ = ["Fleet", "__version__", "fleet_from_tables"]
+__all__ = [
+    "BuildOptions",
+    "Fleet",
+    "Probe2RoadError",
+    "RoadGraph",
+    "TraceGaps",
+    "__version__",
+    "build",
+    "check_graph",
+    "describe_fleet",
+    "evaluate",
+    "fleet_from_tables",
+    "from_networkx",
+    "graph_from_lines",
+    "rasterize",
+    "read_fleet",
+    "read_graph",
+    "to_networkx",
+    "write_fleet",
+    "write_graph",
+    "write_view",
+]
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
-        return getattr(import_module(f"probe2road.{_HOME[name]}"), name)
+        value = getattr(import_module(f"probe2road.{_HOME[name]}"), name)
+        globals()[name] = value
+        return value
     raise AttributeError(f"module 'probe2road' has no attribute {name!r}")
 
 

@@ -6,7 +6,7 @@ import json
 import logging
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +19,14 @@ from probe2road.errors import OptionError, OutputError, Probe2RoadError
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe2road.build import Progress
     from probe2road.fleet import Fleet
+    from probe2road.recipe import Progress
 
 __all__ = ["app", "main"]
 
 logger = logging.getLogger("probe2road")
+
+_VOLUME = ("-v", "--verbose", "-q", "--quiet")
 
 app = typer.Typer(
     name="probe2road",
@@ -88,10 +90,10 @@ def build(
 
     An interrupted run goes on where it stopped when it is started again.
     """
-    from probe2road.build import BuildOptions
-    from probe2road.build import build as build_graph
     from probe2road.export import graph_format, write_graph
     from probe2road.options import load_options
+    from probe2road.recipe import BuildOptions
+    from probe2road.recipe import build as build_graph
 
     for path in output:
         graph_format(path)
@@ -211,10 +213,12 @@ def demo(
         typer.echo(f"  {path}  {what}")
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; an error of ours is one message and exit code 2."""
+    # How much to say is said to the program, but may stand anywhere.
+    arguments = sorted(sys.argv[1:] if arguments is None else arguments, key=lambda word: word not in _VOLUME)
     try:
-        app(standalone_mode=True)
+        app(arguments)
     except Probe2RoadError as error:
         if logger.isEnabledFor(logging.DEBUG):
             raise

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from probe2road.build import Progress, build
 from probe2road.errors import OutputError
 from probe2road.export import write_graph
 from probe2road.fleet import Fleet
@@ -16,6 +15,7 @@ from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path, write_fleet
 from probe2road.metrics import evaluate
 from probe2road.picture import write_filmstrip
+from probe2road.recipe import Progress, build
 from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
 from probe2road.simulate.generate import generate_interchange
 from probe2road.view import write_view

@@ -4,12 +4,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe2road.build import BuildOptions, build
 from probe2road.errors import InputError, OptionError, OutputError
 from probe2road.export import read_graph
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.grid import read_raster
 from probe2road.metrics import evaluate
+from probe2road.recipe import BuildOptions, build
 from probe2road.roadgraph import check_graph, graph_from_lines
 from probe2road.segmentation.density import DensityOptions
 from probe2road.segmentation.segmenter import Segmenter
@@ -64,7 +64,7 @@ def test_every_stage_is_kept_on_request(crossing, tmp_path):
 
 def test_an_interrupted_run_goes_on_where_it_stopped(crossing, tmp_path, monkeypatch):
     whole = build(crossing)
-    monkeypatch.setattr("probe2road.build._WINDOW", 256)
+    monkeypatch.setattr("probe2road.recipe._WINDOW", 256)
     original, predicted = Segmenter.__getattribute__, []
 
     def stop_after_three(self, name):

@@ -1,0 +1,127 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe2road.cli import main
+from probe2road.export import read_graph
+
+
+def run(*arguments, cwd):
+    """Run the command line in a process of its own, as a user does."""
+    program = Path(sys.executable).with_name("probe2road")
+    return subprocess.run([program, *map(str, arguments)], cwd=cwd, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def call(folder, monkeypatch, capsys):
+    """Run the command line in this process, which is quicker: exit code, standard output, standard error."""
+
+    def run_here(*arguments):
+        monkeypatch.chdir(folder)
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            main(list(map(str, arguments)))
+        return stop.value.code, *capsys.readouterr()
+
+    return run_here
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with the drives of six vehicles along two crossing roads, under odd column names."""
+    rng = np.random.default_rng(0)
+    at = np.arange(0, 600, 15.0)
+    drives = []
+    for trip in range(12):
+        east, north = (at, np.full_like(at, 300.0)) if trip % 2 else (np.full_like(at, 300.0), at)
+        table = {"trip": trip, "clock": np.arange(len(at)), "e": 446000 + east, "n": 4636000 + north + rng.normal()}
+        drives.append(pd.DataFrame(table))
+    path = tmp_path_factory.mktemp("cli")
+    pd.concat(drives).to_csv(path / "drives.csv", index=False)
+    return path
+
+
+COLUMNS = ("--columns", "trace_id=trip,t=clock,x=e,y=n", "--crs", "EPSG:32616")
+
+
+@pytest.fixture(scope="module")
+def built(folder):
+    result = run("build", "drives.csv", *COLUMNS, "-o", "roads.gpkg", "-o", "roads.geojson", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    return result
+
+
+def test_build_writes_every_output_and_leaves_nothing_else(folder, built):
+    assert len(read_graph(folder / "roads.gpkg").edges) == len(read_graph(folder / "roads.geojson").edges) == 4
+    assert not list(folder.glob(".*"))
+    assert "segmented" in built.stderr
+
+
+def test_evaluate_prints_scores_with_their_parameters(folder, built, call):
+    code, out, _ = call("evaluate", "roads.gpkg", "roads.geojson", "--metrics", "geo,itopo", "-o", "scores.csv")
+    assert code == 0
+    assert "1.000" in out
+    assert "radius" in out
+    assert pd.read_csv(folder / "scores.csv")["metric"].tolist() == ["geo", "itopo"]
+
+
+def test_info_tells_fleet_data_from_a_graph(built, call):
+    fleet, graph = (json.loads(call("info", *words)[1]) for words in (("drives.csv", *COLUMNS), ("roads.gpkg",)))
+    assert (fleet["content"], fleet["traces"]) == ("fleet data", 12)
+    assert (graph["content"], graph["junctions"]) == ("road graph", 1)
+
+
+@pytest.mark.parametrize("name", ["roads.html", "roads.png"])
+def test_view_draws_a_page_or_a_picture(folder, built, call, name):
+    code, _, err = call("view", "roads.gpkg", "--traces", "drives.csv", *COLUMNS, "-o", name)
+    assert code == 0, err
+    assert (folder / name).stat().st_size > 10_000
+
+
+def test_intermediate_stages_are_kept_on_request(folder, call):
+    options = ("--keep-intermediate", "stages", "--resolution", "2", "-q")
+    assert call("build", "drives.csv", *COLUMNS, *options, "-o", "coarse.gpkg") == (0, "", "")
+    names = {path.name for path in (folder / "stages").iterdir()}
+    assert names >= {"1-probability.tif", "2-mask.tif", "3-skeleton.tif", "4-vectorized.gpkg", "5-cleaned.gpkg"}
+    assert "stages.png" in names
+
+
+def test_options_come_from_toml(folder, call):
+    (folder / "build.toml").write_text("[density]\nbandwidth = 6\n[clean]\ndead_end = 400\n")
+    code, _, err = call("build", "drives.csv", *COLUMNS, "--config", "build.toml", "-o", "toml.gpkg")
+    assert code == 0, err
+    assert len(read_graph(folder / "toml.gpkg").edges) < 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["build", "absent.csv", "-o", "x.gpkg"], "absent.csv: there is no such file"),
+        (["build", "drives.csv", "-o", "x.gpkg"], "column"),
+        (["build", "drives.csv", *COLUMNS[:2], "-o", "x.gpkg"], "no CRS"),
+        (["build", "drives.csv", *COLUMNS, "-o", "x.dxf"], "suffix is of no known format"),
+        (["build", "drives.csv", *COLUMNS, "-o", "absent/x.gpkg"], "does not exist; create it first"),
+        (["build", "drives.csv", *COLUMNS, "--bbox", "1,2,3", "-o", "x.gpkg"], "left,bottom,right,top"),
+        (["build", "drives.csv", "--columns", "trip", "-o", "x.gpkg"], "ours=theirs"),
+        (["build", "drives.csv", *COLUMNS, "--segmenter", "magic", "-o", "x.gpkg"], "use density"),
+        (["build", "drives.csv", *COLUMNS, "--config", "wrong.toml", "-o", "x.gpkg"], "there is no option 'bandwith'"),
+        (["build", "drives.csv", *COLUMNS, "--config", "type.toml", "-o", "x.gpkg"], "is not of type float"),
+        (["evaluate", "absent.gpkg", "absent.gpkg"], "absent.gpkg: no such file"),
+        (["view", "absent.gpkg", "-o", "roads.pdf"], "use .html or .png"),
+        (["info", "absent.parquet"], "absent.parquet: there is no such file"),
+    ],
+)
+def test_bad_input_is_one_clear_error_and_no_output(folder, call, arguments, message):
+    (folder / "wrong.toml").write_text("[density]\nbandwith = 5\n")
+    (folder / "type.toml").write_text("resolution = 'fine'\n")
+    code, _, err = call(*arguments)
+    assert code == 2
+    assert err.count("error: ") == 1
+    assert message in err
+    assert "Traceback" not in err
+    assert not [*folder.glob("x.*"), *folder.glob(".x*")]
