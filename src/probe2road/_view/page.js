@@ -7,6 +7,7 @@ const GREY = "#9aa5b1";
 
 // Paint: every choice of attribute is a list of classes {label, color} and an expression that picks one.
 function edgeColor(attribute) {
+  if (!attribute.classes.length) return GREY;
   const value = ["get", attribute.name];
   const known = attribute.breaks
     ? ["step", ["to-number", value], attribute.classes[0].color,
