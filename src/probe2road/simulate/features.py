@@ -119,7 +119,7 @@ def _painted_lines(network: RoadNetwork) -> pd.DataFrame:
     row = pd.Index(sections.index).get_indexer(borders["section"])
     fast = sections["highway"].str.startswith(("motorway", "trunk")).to_numpy()[row]
     lanes = (sections["lanes_forward"] + sections["lanes_backward"]).to_numpy()[row]
-    style = borders["style"].map(FEATURE_STYLES.index).to_numpy()
+    style = borders["style"].map(FEATURE_STYLES.index).to_numpy().astype(np.int64)
     dashed = (style == 1) | ((style == 2) & (lanes == 2) & (not paint.solid_centre))
     inset = np.where(style == 0, paint.edge_inset, 0.0) * np.where(borders["border"] == 0, 1.0, -1.0)
     moved = {name: borders[name] + inset for name in ("offset", "start_offset", "end_offset")}
@@ -147,7 +147,7 @@ def _boundary_lines(network: RoadNetwork) -> pd.DataFrame:
     shoulder = np.where(fast, np.where(median | structure, _MEDIAN_SHOULDER, paint.shoulder), paint.kerb)
     outwards = np.where(is_left, -shoulder, shoulder)
     moved = {name: edges[name] + outwards for name in ("offset", "start_offset", "end_offset")}
-    codes = np.array([FEATURE_STYLES.index(name) for name in style])
+    codes = np.array([FEATURE_STYLES.index(name) for name in style], dtype=np.int64)
     return edges.assign(row=row, style=codes, dash=np.nan, period=np.nan, **moved)
 
 
@@ -246,9 +246,10 @@ def _runs(samples: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.int64]
     line, keep = samples["line"].to_numpy(), samples["keep"].to_numpy()
     starts = keep.copy()
     starts[1:] &= ~keep[:-1] | (np.diff(line) != 0)
-    run = np.where(keep, np.cumsum(starts) - 1, -1)
+    run = np.cumsum(starts) - 1
     count = np.bincount(run[keep], minlength=int(starts.sum()))
-    long = keep & (count[np.maximum(run, 0)] >= 2) if len(count) else keep
+    long = keep.copy()
+    long[keep] = count[run[keep]] >= 2
     return samples.loc[long, ["x", "y", "z"]].to_numpy(), count[count >= 2], line[starts][count >= 2]
 
 

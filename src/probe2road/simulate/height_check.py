@@ -75,7 +75,7 @@ def check_heights(network: RoadNetwork, *, options: HeightOptions | None = None)
     low = low.rename(columns={"upper": "section", "lower": "other"})
     columns = ["kind", "section", "other", "x", "y", "value", "limit"]
     violations = pd.concat([part[columns] for part in (low, steep, bent)], ignore_index=True)
-    violations["cause"] = _causes(violations, table)
+    violations["cause"] = pd.Series(_causes(violations, table), index=violations.index, dtype="str")
     sections = network.sections.index
     largest = pd.Series(grade).groupby(row).max().reindex(range(len(sections)), fill_value=0.0)
     sharpest = pd.Series(curvature).groupby(owner).max().reindex(range(len(sections)), fill_value=0.0)
