@@ -1,0 +1,139 @@
+"""What belongs to the tree as a whole: layering, start-up time, and documents that agree with the code."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import probe2road
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "probe2road"
+MODULES = {
+    ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in sorted(SOURCE.rglob("*.py"))
+    if path != SOURCE / "__init__.py"
+}
+# Imports inside a function that point downwards, each explained in decision 0001.
+DOWNWARD = {("roadgraph", "export")}
+
+
+def layers() -> list[str]:
+    """Return the order of the modules that decision 0001 declares."""
+    page = (ROOT / "docs" / "decisions" / "0001-layout-and-layering.md").read_text(encoding="utf-8")
+    block = re.search(r"```layers\n(.*?)```", page, re.DOTALL)
+    assert block is not None
+    return [line.split()[0] for line in block[1].splitlines()]
+
+
+def rank(module: str, order: list[str]) -> int:
+    """Return the place of the longest declared name that is the module or a package it is in; -1 if there is none."""
+    names = [name for name in order if module == name or module.startswith(f"{name}.")]
+    return order.index(max(names, key=len)) if names else -1
+
+
+def imports(module: str) -> Iterator[str]:
+    """Yield the modules of ours that a module imports, anywhere in its code."""
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            found = [f"{node.module}.{alias.name}" for alias in node.names] + [node.module]
+        else:
+            continue
+        for name in found:
+            if name.removeprefix("probe2road.") in MODULES and name.startswith("probe2road."):
+                yield name.removeprefix("probe2road.")
+
+
+def test_every_module_has_a_layer_and_every_layer_a_module() -> None:
+    order = layers()
+    assert len(order) == len(set(order))
+    assert [module for module in MODULES if rank(module, order) < 0] == []
+    assert [name for name in order if name not in MODULES] == []
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_module_imports_only_what_stands_above_it(module: str) -> None:
+    order = layers()
+    below = [name for name in imports(module) if rank(name, order) > rank(module, order)]
+    assert [name for name in below if (module, name) not in DOWNWARD] == []
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    graph = {
+        module: {name for name in imports(module) if (module, name) not in DOWNWARD and name != module}
+        for module in MODULES
+    }
+    assert len(list(TopologicalSorter(graph).static_order())) == len(MODULES)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_module_has_a_docstring_and_says_what_is_public(module: str) -> None:
+    tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
+    assert ast.get_docstring(tree), "no docstring"
+    if MODULES[module].name == "__init__.py" and not list(imports(module)):
+        return  # a package that exports nothing
+    public = next(
+        ast.literal_eval(node.value)
+        for node in tree.body
+        if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["__all__"]
+    )
+    assert public, "__all__ is empty"
+    assert len(public) == len(set(public))
+
+
+def test_public_verbs_are_there() -> None:
+    assert [name for name in probe2road.__all__ if not hasattr(probe2road, name)] == []
+
+
+def test_import_is_quick_and_loads_nothing_heavy() -> None:
+    code = (
+        "import json, sys, time; before = set(sys.modules); start = time.perf_counter(); import probe2road; "
+        "print(json.dumps([time.perf_counter() - start, sorted(set(sys.modules) - before)]))"
+    )
+    # The best of three, because the machine may be busy with other tests.
+    runs = [
+        json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+        for _ in range(3)
+    ]
+    assert min(seconds for seconds, _ in runs) < 0.5
+    assert {"torch", "geopandas", "numba", "pandas", "matplotlib"}.isdisjoint(runs[0][1])
+
+
+def test_version_is_that_of_the_package() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert probe2road.__version__ == project["version"]
+
+
+def test_readme_shows_two_commands() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```(\w*)\n(.*?)```", readme, re.DOTALL)
+    commands = [line for language, text in blocks if language != "python" for line in text.splitlines()]
+    assert commands == ["make demo", "make test"]
+
+
+def test_every_module_is_in_the_reference() -> None:
+    pages = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs" / "reference").glob("*.md"))
+    listed = re.findall(r"^::: probe2road\.(\S+)$", pages, re.MULTILINE)
+    documented_by_hand = {"cli"}
+    packages = {name for name, path in MODULES.items() if path.name == "__init__.py"}
+    modules = sorted(set(MODULES) - packages - documented_by_hand)
+    assert [name for name in modules if not any(f"{name}.".startswith(f"{entry}.") for entry in listed)] == []
+    assert [name for name in listed if name not in MODULES] == []
+
+
+def test_relative_links_of_the_root_documents_lead_somewhere() -> None:
+    for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
+        text = (ROOT / name).read_text(encoding="utf-8")
+        links = [link for link in re.findall(r"\]\(([^)#]+)", text) if "://" not in link]
+        assert [link for link in links if not (ROOT / link).exists()] == [], name
