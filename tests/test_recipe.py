@@ -11,8 +11,7 @@ from probe2road.grid import read_raster
 from probe2road.metrics import evaluate
 from probe2road.recipe import BuildOptions, build
 from probe2road.roadgraph import check_graph, graph_from_lines
-from probe2road.segmentation.density import DensityOptions
-from probe2road.segmentation.segmenter import Segmenter
+from probe2road.segmentation.density import DensityOptions, density_probability
 from probe2road.workspace import fingerprint
 
 CRS = "EPSG:32616"
@@ -65,24 +64,24 @@ def test_every_stage_is_kept_on_request(crossing, tmp_path):
 def test_an_interrupted_run_goes_on_where_it_stopped(crossing, tmp_path, monkeypatch):
     whole = build(crossing)
     monkeypatch.setattr("probe2road.recipe._WINDOW", 256)
-    original, predicted = Segmenter.__getattribute__, []
+    windows = []
 
-    def stop_after_three(self, name):
-        if name == "predict":
-            if len(predicted) == 3:
-                raise KeyboardInterrupt
-            predicted.append(name)
-        return original(self, name)
+    def counting(counts, grid, options):
+        if len(windows) == 3:
+            windows.append("stop")
+            raise KeyboardInterrupt
+        windows.append(grid.bounds)
+        return density_probability(counts, grid, options)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Segmenter, "__getattribute__", stop_after_three)
-        with pytest.raises(KeyboardInterrupt):
-            build(crossing, workspace=tmp_path / "work")
-    kept = sorted((tmp_path / "work").glob("window-*.npy"))
-    assert len(kept) == 3
-    before = [file.stat().st_mtime_ns for file in kept]
-    graph = build(crossing, workspace=tmp_path / "work")
-    assert [file.stat().st_mtime_ns for file in kept] == before
+    monkeypatch.setattr("probe2road.segmentation.density.density_probability", counting)
+    options = BuildOptions(density=DensityOptions(bandwidth=4.5))  # estimating one would predict, too
+    with pytest.raises(KeyboardInterrupt):
+        build(crossing, options, workspace=tmp_path / "work")
+    assert len(list((tmp_path / "work").glob("window-*.npy"))) == 3
+    graph = build(crossing, options, workspace=tmp_path / "work")
+    windows.remove("stop")
+    assert len(windows) == len(set(windows)) > 3  # none was done twice
+    assert not list((tmp_path / "work").glob("window-*.npy"))
     assert graph.edges.geometry.geom_equals_exact(whole.edges.geometry, 1e-6).all()
 
 

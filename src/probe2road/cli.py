@@ -92,7 +92,7 @@ def build(
     """
     from probe2road.export import graph_format, write_graph
     from probe2road.options import load_options
-    from probe2road.recipe import BuildOptions
+    from probe2road.recipe import BuildOptions, draw_stages
     from probe2road.recipe import build as build_graph
 
     for path in output:
@@ -110,9 +110,7 @@ def build(
     for path in output:
         write_graph(graph, path)
     if keep_intermediate:
-        from probe2road.picture import write_filmstrip
-
-        write_filmstrip(keep_intermediate, keep_intermediate / "stages.png", fleet=fleet)
+        draw_stages(keep_intermediate, fleet, keep_intermediate / "stages.png")
     else:
         shutil.rmtree(workspace, ignore_errors=True)
 

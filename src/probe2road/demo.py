@@ -14,8 +14,7 @@ from probe2road.fleet import Fleet
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path, write_fleet
 from probe2road.metrics import evaluate
-from probe2road.picture import write_filmstrip
-from probe2road.recipe import Progress, build
+from probe2road.recipe import Progress, build, draw_stages
 from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
 from probe2road.simulate.generate import generate_interchange
 from probe2road.view import write_view
@@ -87,7 +86,7 @@ def run_demo(folder: str | Path, *, progress: Progress | None = None) -> tuple[d
 
     view, filmstrip = folder / "roads.html", folder / "stages.png"
     write_view(graph, view, traces=fleet, title="probe2road demo: a cloverleaf")
-    write_filmstrip(folder / "stages", filmstrip, fleet=fleet)
+    draw_stages(folder / "stages", fleet, filmstrip)
     files = {
         view: "the roads over the traces, in any browser",
         filmstrip: "how they came about, stage by stage",

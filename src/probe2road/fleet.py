@@ -143,9 +143,14 @@ def trace_breaks(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool
     interval = _intervals(fleet.traces["t"])
     within = ~breaks
     owner = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    # Only traces with a fix beyond a fixed limit need their medians: few, where the data is dense.
+    suspect = np.zeros(len(starts) - 1, bool)
+    with np.errstate(invalid="ignore"):
+        suspect[owner[within & ((interval > gaps.max_interval) | (step > gaps.max_step))]] = True
+    counted = within & suspect[owner]
 
-    interval_limit = _grown_limit(interval, within, owner, gaps.max_interval, gaps.interval_factor)
-    step_limit = _grown_limit(step, within & (step > 1.0), owner, gaps.max_step, gaps.step_factor)
+    interval_limit = _grown_limit(interval, counted, owner, gaps.max_interval, gaps.interval_factor)
+    step_limit = _grown_limit(step, counted & (step > 1.0), owner, gaps.max_step, gaps.step_factor)
     with np.errstate(invalid="ignore"):
         late = (interval > interval_limit[owner]) & (step > gaps.standing_step)
         breaks |= within & (late | (step > step_limit[owner]))

@@ -155,13 +155,22 @@ def _members_of_windows(
     """
     offsets = np.zeros(window_rows * window_cols + 1, np.int64)
     members = np.empty(0, np.int64)
+    only = np.full(len(row), -1, np.int32)  # most segments touch one window, found in the first pass
     for fill in range(2):
         for fix in range(len(row)):
+            if only[fix] >= 0:
+                members[offsets[only[fix]]] = fix
+                offsets[only[fix]] += 1
+                continue
             before = fix if breaks[fix] else fix - 1
             low_row, high_row = min(row[fix], row[before]), max(row[fix], row[before])
             low_col, high_col = min(col[fix], col[before]), max(col[fix], col[before])
-            for i in range(max(0, (low_row - halo) // size), min(window_rows - 1, (high_row + halo) // size) + 1):
-                for j in range(max(0, (low_col - halo) // size), min(window_cols - 1, (high_col + halo) // size) + 1):
+            top, bottom = max(0, (low_row - halo) // size), min(window_rows - 1, (high_row + halo) // size)
+            left, right = max(0, (low_col - halo) // size), min(window_cols - 1, (high_col + halo) // size)
+            if fill == 0 and top == bottom and left == right:
+                only[fix] = top * window_cols + left
+            for i in range(top, bottom + 1):
+                for j in range(left, right + 1):
                     window = i * window_cols + j
                     if fill == 1:
                         members[offsets[window]] = fix

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from probe2road.clean import CleanOptions, clean_graph
 from probe2road.errors import OptionError
+from probe2road.export import read_graph
 from probe2road.fleet import Fleet, TraceGaps
-from probe2road.grid import Grid
-from probe2road.raster import fleet_grid, rasterize_windows
+from probe2road.grid import Grid, read_raster
+from probe2road.picture import Stage, write_filmstrip
+from probe2road.raster import fleet_grid, rasterize, rasterize_windows
 from probe2road.roadgraph import RoadGraph
 from probe2road.segmentation.density import DensityOptions, density_segmenter
 from probe2road.segmentation.mask import threshold_mask
@@ -23,7 +25,7 @@ from probe2road.skeleton import skeletonize_windows
 from probe2road.vectorize import VectorizeOptions, vectorize
 from probe2road.workspace import Workspace, open_workspace
 
-__all__ = ["SEGMENTERS", "BuildOptions", "Progress", "build"]
+__all__ = ["SEGMENTERS", "BuildOptions", "Progress", "build", "draw_stages"]
 
 logger = logging.getLogger(__name__)
 
@@ -127,6 +129,8 @@ def _segment(
 ) -> tuple[NDArray[np.float32], Segmenter]:
     """Centreline probability of the whole grid ``(rows, cols)``; pages nobody drove on are never touched."""
     segmenter = density_segmenter(fleet, grid, options.density, gaps=options.gaps)
+    if (kept := work.read_raster("1-probability", grid)) is not None:
+        return kept, segmenter
     probability = np.zeros(grid.shape, np.float32)
     driven = 0
     parts = rasterize_windows(fleet, grid, size=_WINDOW, halo=segmenter.halo, gaps=options.gaps)
@@ -142,7 +146,39 @@ def _segment(
     report("segmentation", grid.rows, grid.rows)
     logger.info("segmented %d windows of %d of %d px (%s)", driven, len(grid.windows(_WINDOW)), _WINDOW, segmenter.name)
     work.write_raster("1-probability", probability, grid)
+    work.drop_arrays()
     return probability, segmenter
+
+
+def draw_stages(folder: str | Path, fleet: Fleet, path: str | Path) -> None:
+    """Draw what the stages of a run left in its workspace, side by side, as a PNG.
+
+    Parameters
+    ----------
+    folder
+        Workspace of a finished `build`.
+    fleet
+        The fleet it was built from.
+    path
+        The picture.
+
+    Raises
+    ------
+    InputError
+        If a stage is missing.
+    """
+    folder = Path(folder)
+    probability, grid = read_raster(folder / "1-probability.tif")
+    skeleton, _ = read_raster(folder / "3-skeleton.tif")
+    traces = rasterize(fleet, grid)[0]
+    panels = [
+        Stage("Traces", traces, grid, f"{fleet.n_traces:,} traces, {len(fleet.traces):,} fixes"),
+        Stage("Probability", probability[0], grid, "of a centreline"),
+        Stage("Skeleton", skeleton[0].astype(bool), grid, f"{int(skeleton.sum()):,} pixels"),
+        Stage("Graph", read_graph(folder / "4-vectorized.gpkg")),
+        Stage("Cleaned graph", read_graph(folder / "5-cleaned.gpkg")),
+    ]
+    write_filmstrip(panels, path)
 
 
 def _silent(stage: str, done: int, total: int) -> None:

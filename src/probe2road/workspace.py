@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from probe2road.errors import OutputError
 from probe2road.export import read_graph, write_graph
 from probe2road.fleet import Fleet
-from probe2road.grid import Grid, write_raster
+from probe2road.grid import Grid, read_raster, write_raster
 from probe2road.io.atomic import atomic_path
 from probe2road.roadgraph import RoadGraph
 
@@ -47,6 +47,17 @@ class Workspace:
         if self.folder is not None:
             write_raster(self.folder / f"{name}.tif", array, grid, names=[name])
 
+    def read_raster(self, name: str, grid: Grid) -> NDArray[Any] | None:
+        """Return the one band of a raster an earlier run kept on this grid, or None."""
+        path = None if self.folder is None else self.folder / f"{name}.tif"
+        if path is None or not path.exists():
+            return None
+        array, kept_grid = read_raster(path)
+        if kept_grid.shape != grid.shape:
+            return None
+        logger.info("taking %s from an earlier run", path.name)
+        return array[0]
+
     def write_graph(self, name: str, graph: RoadGraph) -> None:
         """Keep a graph as ``NAME.gpkg``."""
         if self.folder is not None:
@@ -70,6 +81,12 @@ class Workspace:
         """Return an array an earlier run kept, or None."""
         path = None if self.folder is None else self.folder / f"{name}.npy"
         return np.load(path) if path is not None and path.exists() else None
+
+    def drop_arrays(self) -> None:
+        """Remove the arrays, once a raster holds them all."""
+        if self.folder is not None:
+            for path in self.folder.glob("*.npy"):
+                path.unlink()
 
 
 def open_workspace(folder: str | Path | None, fleet: Fleet, options: DataclassInstance) -> Workspace:
