@@ -18,7 +18,7 @@ __all__ = ["FieldComments"]
 class FieldComments(griffe.Extension):
     """Give undocumented attributes of classes the comment that ends their line."""
 
-    def on_class_members(self, *, cls: griffe.Class, **kwargs: Any) -> None:
+    def on_class_members(self, *, cls: griffe.Class, **_: Any) -> None:
         """Document the fields of one class."""
         if not any("dataclass" in str(decorator.value) for decorator in cls.decorators):
             return
