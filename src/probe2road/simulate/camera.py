@@ -14,6 +14,7 @@ puts them where the vehicle believes to be.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -93,6 +94,22 @@ class Detections:
     body: NDArray[np.float64]  # (n, 3) m: forward, to the right, up from the road under the vehicle
     kind: NDArray[np.int8]  # (n,)
     feature: NDArray[np.int64]  # (n,) line that was seen; -1 for a false point
+
+
+class _View(NamedTuple):
+    """The part of a camera model that decides what is in view, in a form that compiled code can take."""
+
+    near: float  # m
+    far: float  # m
+    slope: float  # tangent of the half angle
+    range_decay: float  # m
+    in_view: float  # m driven that count fully while a piece passes through the view
+    lane_reach: float  # m
+    lane_decay: float  # m
+    boundary_reach: float  # m
+    boundary_decay: float  # m
+    altitude_gate: float  # m
+    altitude_slope: float
 
 
 def feature_index(
@@ -186,14 +203,10 @@ def see(
     outage = _alternating(driven, model.outage_every, model.outage_length, rng)
     followed = np.stack([_alternating(driven, model.boundary_lost, model.boundary_found, rng) for _ in range(2)])
     vehicles = _vehicles(driven, model, rng)
-    options = (
-        model.near, model.far, np.tan(np.radians(model.half_angle)), model.range_decay, model.lane_reach,
-        model.lane_decay, model.boundary_reach, model.boundary_decay, model.altitude_gate, model.altitude_slope,
-        model.false_rate,
-    )  # fmt: skip
+    view = _view(model)
     keyframe, body, kind, feature = _detect(
         xyz - index.origin, heading, driven, ~outage, followed, vehicles, index.pieces, index.kind, index.weight,
-        index.feature, index.cells, index.columns, options, rng,
+        index.feature, index.cells, index.columns, view, model.false_rate, rng,
     )  # fmt: skip
     return Detections(keyframe, _with_noise(body, keyframe, kind, pitch, yaw, model, rng), kind, feature)
 
@@ -224,6 +237,13 @@ def _with_noise(
     # A point cannot be measured behind the camera, however wrong its range is.
     stretch = np.maximum(stretch, 0.3)
     return np.stack([forward * stretch - yaw * right, right * stretch + across + yaw * forward, up + lift], axis=1)
+
+
+def _view(model: CameraModel) -> _View:
+    """Extract what decides whether a point is in view."""
+    in_view = model.range_decay * (1.0 - np.exp((model.near - model.far) / model.range_decay))
+    same = {name: getattr(model, name) for name in _View._fields if name not in ("slope", "in_view")}
+    return _View(slope=float(np.tan(np.radians(model.half_angle))), in_view=float(in_view), **same)
 
 
 @njit(cache=True)
@@ -285,72 +305,72 @@ def _detect(
     feature: NDArray[np.int64],
     cells: NDArray[np.int64],
     columns: int,
-    options: tuple[float, ...],
+    view: _View,
+    false_rate: float,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int8], NDArray[np.int64]]:
     """Look from every keyframe: keyframe, true place in the vehicle frame, kind and line of each point reported."""
-    near, far, slope, decay, lane_reach, lane_decay, boundary_reach, boundary_decay, gate, gate_slope, false_rate = (
-        options
-    )
-    in_view = decay * (1.0 - np.exp((near - far) / decay))  # m driven that count fully while a piece is in view
+    codes = [(0, 0, 0) for _ in range(0)]  # keyframe, kind, line; empty lists whose types the compiler can tell
+    places = [(0.0, 0.0, 0.0) for _ in range(0)]
     rows = (len(cells) - 1) // columns
-    room = 1024
-    out_frame, out_body = np.zeros(room, np.int64), np.zeros((room, 3))
-    out_kind, out_feature = np.zeros(room, np.int8), np.zeros(room, np.int64)
-    n = 0
     for i in range(len(xyz)):
         if not working[i] or driven[i] <= 0:
             continue
         sin, cos = np.sin(heading[i]), np.cos(heading[i])
         x, y, z = xyz[i]
-        c0, c1, r0, r1 = _cells_in_view(x, y, sin, cos, near, far, slope, columns, rows)
+        c0, c1, r0, r1 = _cells_in_view(x, y, sin, cos, view, columns, rows)
         for row in range(r0, r1):
             for k in range(cells[row * columns + c0], cells[row * columns + c1]):
                 u = rng.random()
                 px = pieces[k, 0] + u * (pieces[k, 3] - pieces[k, 0]) - x
                 py = pieces[k, 1] + u * (pieces[k, 4] - pieces[k, 1]) - y
-                forward, right = px * sin + py * cos, px * cos - py * sin
-                if forward < near or forward > far or abs(right) > slope * forward:
-                    continue
                 up = pieces[k, 2] + u * (pieces[k, 5] - pieces[k, 2]) - z
-                if abs(up) > gate + gate_slope * forward:
+                forward, right = px * sin + py * cos, px * cos - py * sin
+                if kind[k] == ROAD_BOUNDARY and not followed[0 if right < 0 else 1, i]:
                     continue
-                chance = driven[i] / in_view * weight[k] * np.exp((near - forward) / decay)
-                if kind[k] == ROAD_BOUNDARY:
-                    if not followed[0 if right < 0 else 1, i]:
-                        continue
-                    beyond = max(abs(right) - boundary_reach, 0.0) / boundary_decay
-                else:
-                    beyond = max(abs(right) - lane_reach, 0.0) / lane_decay
-                if rng.random() > chance * np.exp(-0.5 * beyond * beyond) or _hidden(forward, right, vehicles[:, i]):
-                    continue
-                if n + 1 >= room:
-                    out_frame, out_body, out_kind, out_feature = _grown(out_frame, out_body, out_kind, out_feature)
-                    room = len(out_frame)
-                out_frame[n], out_kind[n], out_feature[n] = i, kind[k], feature[k]
-                out_body[n, 0], out_body[n, 1], out_body[n, 2] = forward, right, up
-                n += 1
+                chance = driven[i] * weight[k] * _visibility(forward, right, up, kind[k], view)
+                if rng.random() < chance and not _hidden(forward, right, vehicles[:, i]):
+                    codes.append((i, int(kind[k]), feature[k]))
+                    places.append((forward, right, up))
         if rng.random() < false_rate * driven[i]:
-            if n + 1 >= room:
-                out_frame, out_body, out_kind, out_feature = _grown(out_frame, out_body, out_kind, out_feature)
-                room = len(out_frame)
-            forward = near + (far - near) * rng.random()
-            out_frame[n], out_kind[n], out_feature[n] = i, LANE_MARKING if rng.random() < 0.5 else ROAD_BOUNDARY, -1
-            out_body[n, 0], out_body[n, 1] = forward, (2.0 * rng.random() - 1.0) * slope * forward
-            out_body[n, 2] = 0.0
-            n += 1
-    return out_frame[:n], out_body[:n], out_kind[:n], out_feature[:n]
+            forward = view.near + (view.far - view.near) * rng.random()
+            right = (2.0 * rng.random() - 1.0) * view.slope * forward
+            codes.append((i, LANE_MARKING if rng.random() < 0.5 else ROAD_BOUNDARY, -1))
+            places.append((forward, right, 0.0))
+    body = np.zeros((len(places), 3))
+    for row in range(len(places)):
+        body[row, 0], body[row, 1], body[row, 2] = places[row]
+    return (
+        np.array([code[0] for code in codes], np.int64),
+        body,
+        np.array([code[1] for code in codes], np.int8),
+        np.array([code[2] for code in codes], np.int64),
+    )
+
+
+@njit(cache=True)
+def _visibility(forward: float, right: float, up: float, kind: int, view: _View) -> float:
+    """Points that a piece of unit weight at this place yields on a metre driven; 0 where it is out of view."""
+    if forward < view.near or forward > view.far or abs(right) > view.slope * forward:
+        return 0.0
+    if abs(up) > view.altitude_gate + view.altitude_slope * forward:
+        return 0.0
+    reach, fall = view.lane_reach, view.lane_decay
+    if kind == ROAD_BOUNDARY:
+        reach, fall = view.boundary_reach, view.boundary_decay
+    beyond = max(abs(right) - reach, 0.0) / fall
+    return np.exp((view.near - forward) / view.range_decay - 0.5 * beyond * beyond) / view.in_view
 
 
 @njit(cache=True)
 def _cells_in_view(
-    x: float, y: float, sin: float, cos: float, near: float, far: float, slope: float, columns: int, rows: int
+    x: float, y: float, sin: float, cos: float, view: _View, columns: int, rows: int
 ) -> tuple[int, int, int, int]:
     """Columns ``c0:c1`` and rows ``r0:r1`` of the cells that may hold a piece in the field of view."""
     low_x, high_x, low_y, high_y = np.inf, -np.inf, np.inf, -np.inf
-    for forward in (near, far):
+    for forward in (view.near, view.far):
         for side in (-1.0, 1.0):
-            right = side * slope * forward
+            right = side * view.slope * forward
             px, py = x + forward * sin + right * cos, y + forward * cos - right * sin
             low_x, high_x, low_y, high_y = min(low_x, px), max(high_x, px), min(low_y, py), max(high_y, py)
     margin = _LONGEST_PIECE / 2.0  # a piece lies in the cell of its middle
@@ -381,15 +401,3 @@ def _hidden(forward: float, right: float, vehicles: NDArray[np.float64]) -> bool
             if abs(rear) > abs(middle) - 0.9:
                 return True
     return False
-
-
-@njit(cache=True)
-def _grown(
-    frame: NDArray[np.int64], body: NDArray[np.float64], kind: NDArray[np.int8], feature: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int8], NDArray[np.int64]]:
-    """Return the arrays with twice the room."""
-    n = len(frame)
-    new_frame, new_body = np.zeros(2 * n, np.int64), np.zeros((2 * n, 3))
-    new_kind, new_feature = np.zeros(2 * n, np.int8), np.zeros(2 * n, np.int64)
-    new_frame[:n], new_body[:n], new_kind[:n], new_feature[:n] = frame, body, kind, feature
-    return new_frame, new_body, new_kind, new_feature

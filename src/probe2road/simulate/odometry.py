@@ -137,8 +137,8 @@ def _filter(
     error, turned, sigma = np.zeros((n, 3)), np.zeros(n), np.zeros(n)
     e = np.zeros(3)
     weave, drift, own = heading_sigma * normal[0, 0], 0.0, min(gnss_sigma[0], gate)
-    if n and not covered[0]:
-        # The filter has run before the drive begins: it starts near the slow part of the GNSS error.
+    if n:
+        # The filter has run before the drive begins, so it starts near the GNSS error, in a tunnel too.
         size = np.hypot(gnss[0, 0], gnss[0, 1])
         e[:] = gnss[0] * min(1.0, gate / max(size, 1e-9))
         e[2] = min(max(gnss[0, 2], -2.0 * gate), 2.0 * gate)
