@@ -1,0 +1,1 @@
+"""What `probe2road.mapmatch` is made of: states, observations, two hidden Markov models, tables."""

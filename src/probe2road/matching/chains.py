@@ -1,0 +1,193 @@
+"""From the chosen candidates of key fixes to matched paths: the edges driven, and the place of every fix on them.
+
+Legend of array shapes: F fixes, T traces, S steps of all traces one after another.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from probe2road.matching.candidates import nearest_on_edge, new_scratch
+from probe2road.matching.network import Follow, States
+from probe2road.matching.routes import Labels, new_labels
+from probe2road.matching.viterbi import (
+    Candidates,
+    Observations,
+    Parameters,
+    decide,
+    find_candidates,
+    shortest,
+)
+
+__all__ = ["Paths", "match_over_routes"]
+
+
+class Paths(NamedTuple):
+    """Matched paths of many traces.
+
+    Attributes
+    ----------
+    step
+        Shape (F,): row of the step a fix lies on, or -1.
+    along, distance
+        Shape (F,): offset from u, and distance to the edge, m; NaN where unmatched.
+    near
+        Shape (F,), bool: whether there was any candidate to choose from.
+    state, trace, part
+        Shape (S,): directed edge, row of the trace, and number of the part of the trace.
+    entered
+        Shape (S,), bool: the path came over the start node of the directed edge, from the step before.
+    """
+
+    step: NDArray[np.int64]
+    along: NDArray[np.float64]
+    distance: NDArray[np.float64]
+    near: NDArray[np.bool_]
+    state: NDArray[np.int64]
+    trace: NDArray[np.int64]
+    part: NDArray[np.int64]
+    entered: NDArray[np.bool_]
+
+
+class _Steps(NamedTuple):
+    """Steps found so far; numba grows lists, not arrays."""
+
+    state: list[int]
+    trace: list[int]
+    part: list[int]
+    entered: list[bool]
+
+
+@njit(cache=True)
+def match_over_routes(
+    states: States, follow: Follow, observed: Observations, starts: NDArray[np.int64], parameters: Parameters
+) -> Paths:
+    """Match all traces; trace i has the fixes ``starts[i]`` to ``starts[i + 1]``."""
+    n_fixes = len(observed.x)
+    paths = Paths(
+        np.full(n_fixes, -1, np.int64),
+        np.full(n_fixes, np.nan),
+        np.full(n_fixes, np.nan),
+        np.zeros(n_fixes, np.bool_),
+        np.empty(0, np.int64),
+        np.empty(0, np.int64),
+        np.empty(0, np.int64),
+        np.empty(0, np.bool_),
+    )
+    steps = _Steps([0 for _ in range(0)], [0 for _ in range(0)], [0 for _ in range(0)], [False for _ in range(0)])
+    scratch = new_scratch(len(states.x))
+    labels = new_labels(len(states.head))
+    number = 0
+    for trace in range(len(starts) - 1):
+        keys = starts[trace] + np.flatnonzero(observed.key[starts[trace] : starts[trace + 1]])
+        candidates = find_candidates(states, observed, keys, parameters, scratch)
+        decision, number = decide(states, follow, observed, keys, candidates, parameters, labels, number)
+        part = -1
+        for k in range(len(keys)):
+            stop = keys[k + 1] if k + 1 < len(keys) else starts[trace + 1]
+            paths.near[keys[k] : stop] = candidates.first[k + 1] > candidates.first[k]
+            chosen = decision.chosen[k]
+            if chosen < 0:
+                continue
+            if decision.linked[k]:
+                number = _follow_route(
+                    states,
+                    follow,
+                    observed,
+                    keys,
+                    k,
+                    candidates,
+                    decision.chosen,
+                    parameters,
+                    labels,
+                    number,
+                    steps,
+                    paths,
+                )
+            else:
+                part += 1
+                steps.state.append(candidates.state[chosen])
+                steps.trace.append(trace)
+                steps.part.append(part)
+                steps.entered.append(False)
+            _place(paths, keys[k], len(steps.state) - 1, candidates.along[chosen], candidates.distance[chosen])
+            if k + 1 == len(keys) or not decision.linked[k + 1]:
+                _place_behind(states, observed, keys[k] + 1, stop, parameters.radius, steps, paths)
+    return Paths(
+        paths.step, paths.along, paths.distance, paths.near,
+        np.array(steps.state, np.int64), np.array(steps.trace, np.int64),
+        np.array(steps.part, np.int64), np.array(steps.entered, np.bool_),
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _place(paths: Paths, fix: int, step: int, along: float, distance: float) -> None:
+    paths.step[fix], paths.along[fix], paths.distance[fix] = step, along, distance
+
+
+@njit(cache=True)
+def _follow_route(
+    states: States, follow: Follow, observed: Observations, keys: NDArray[np.int64], k: int,
+    candidates: Candidates, chosen: NDArray[np.int64], parameters: Parameters, labels: Labels, number: int,
+    steps: _Steps, paths: Paths,
+) -> int:  # fmt: skip
+    """Append the steps from the key before to key k, and place the fixes between them on the way."""
+    source, target = chosen[k - 1], chosen[k]
+    number, stays = shortest(states, follow, observed, keys, k, candidates, source, target, parameters, labels, number)
+    first = len(steps.state) - 1
+    if not stays:
+        route = [candidates.state[target]]
+        while labels.before[route[-1]] >= 0:
+            route.append(labels.before[route[-1]])
+        for r in range(len(route) - 1, -1, -1):
+            steps.state.append(route[r])
+            steps.trace.append(steps.trace[first])
+            steps.part.append(steps.part[first])
+            steps.entered.append(True)
+    begin, end = candidates.along[source], candidates.along[target]
+    last = len(steps.state) - 1
+    reached = first
+    for fix in range(keys[k - 1] + 1, keys[k]):
+        best, best_along, best_step = np.inf, begin, reached
+        for step in range(reached, last + 1):
+            low, high = _driven_span(states, steps.state[step], begin, end, step == first, step == last)
+            along, distance = nearest_on_edge(
+                states, steps.state[step] >> 1, observed.x[fix], observed.y[fix], low, high
+            )
+            if distance < best:
+                best, best_along, best_step = distance, along, step
+        reached = best_step
+        _place(paths, fix, best_step, best_along, best)
+    return number
+
+
+@njit(cache=True)
+def _driven_span(
+    states: States, state: int, begin: float, end: float, is_first: bool, is_last: bool
+) -> tuple[float, float]:
+    """Return the offsets from u, ascending, between which a directed edge was driven."""
+    length = states.length[state >> 1]
+    reverse = state & 1
+    start, stop = (length, 0.0) if reverse else (0.0, length)
+    if is_first:
+        start = begin
+    if is_last:
+        stop = end
+    return min(start, stop), max(start, stop)
+
+
+@njit(cache=True)
+def _place_behind(
+    states: States, observed: Observations, start: int, stop: int, radius: float, steps: _Steps, paths: Paths
+) -> None:
+    """Place the fixes behind the last key fix of a part on its last edge, where they are within the radius."""
+    step = len(steps.state) - 1
+    edge = steps.state[step] >> 1
+    for fix in range(start, stop):
+        along, distance = nearest_on_edge(states, edge, observed.x[fix], observed.y[fix], 0.0, states.length[edge])
+        if distance <= radius:
+            _place(paths, fix, step, along, distance)

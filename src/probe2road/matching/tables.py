@@ -1,0 +1,136 @@
+"""Matched paths as the tables that `probe2road.mapmatch.Matches` promises."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from probe2road.fleet import Fleet
+from probe2road.matching.chains import Paths
+from probe2road.matching.network import States
+from probe2road.roadgraph import RoadGraph
+
+__all__ = ["fix_table", "joined_paths", "step_table"]
+
+
+def joined_paths(found: list[tuple[NDArray[np.int64], Paths]], starts: NDArray[np.int64]) -> Paths:
+    """Bring the paths of groups of traces into the order of all traces.
+
+    Parameters
+    ----------
+    found
+        For each group, the numbers of its traces, ascending, and its paths; together all traces.
+    starts
+        Shape (traces + 1,): first fix of every trace, and the number of fixes.
+    """
+    if len(found) == 1:
+        return found[0][1]
+    trace = np.concatenate([traces[paths.trace] for traces, paths in found])
+    order = np.argsort(trace, kind="stable")
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    owner = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    fixes = np.argsort(np.concatenate([np.flatnonzero(np.isin(owner, traces)) for traces, _ in found]))
+    offset, step = 0, []
+    for _, paths in found:
+        moved = np.full(len(paths.step), -1, np.int64)
+        on = paths.step >= 0
+        moved[on] = rank[paths.step[on] + offset]
+        step.append(moved)
+        offset += len(paths.state)
+
+    def of_fixes(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(paths, name) for _, paths in found])[fixes]
+
+    def of_steps(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(paths, name) for _, paths in found])[order]
+
+    return Paths(
+        step=np.concatenate(step)[fixes],
+        along=of_fixes("along"),
+        distance=of_fixes("distance"),
+        near=of_fixes("near"),
+        state=of_steps("state"),
+        trace=trace[order],
+        part=of_steps("part"),
+        entered=of_steps("entered"),
+    )
+
+
+def fix_table(
+    fleet: Fleet, graph: RoadGraph, states: States, paths: Paths, radius: NDArray[np.float64]
+) -> pd.DataFrame:
+    """Write one row for each fix; ``radius`` (m), shape (traces,), is what its trace was searched within."""
+    matched = paths.step >= 0
+    state = np.zeros(len(matched), np.int64)
+    state[matched] = paths.state[paths.step[matched]]
+    edge_id = graph.edges.index.to_numpy()
+    edge = np.zeros(len(matched), np.int64)
+    edge[matched] = edge_id[state[matched] >> 1]
+    return pd.DataFrame(
+        {
+            "trace_id": fleet.traces["trace_id"].array,
+            "t": fleet.traces["t"].array,
+            "edge": pd.arrays.IntegerArray(edge, ~matched),
+            "offset": np.where(matched, paths.along, np.nan),
+            "distance": np.where(matched, paths.distance, np.nan),
+            "forward": pd.arrays.BooleanArray(state & 1 == 0, ~matched),
+            "reason": _reasons(fleet, states, paths, radius),
+        },
+    )
+
+
+def _reasons(fleet: Fleet, states: States, paths: Paths, radius: NDArray[np.float64]) -> pd.Categorical:
+    """Say of every fix without an edge why, missing for the others."""
+    names = [f"no edge within {value:g} m" for value in np.unique(radius)]
+    fits_none, no_edges = len(names), len(names) + 1
+    code = np.repeat(np.searchsorted(np.unique(radius), radius), np.diff(fleet.starts))
+    code[paths.near] = fits_none
+    if not len(states.length):
+        code[:] = no_edges
+    code[paths.step >= 0] = -1
+    return pd.Categorical.from_codes(code, [*names, "edges near, but none fits", "the graph has no edges"])
+
+
+def step_table(fleet: Fleet, graph: RoadGraph, states: States, paths: Paths) -> pd.DataFrame:
+    """Write one row for each traversal of an edge."""
+    n_steps = len(paths.state)
+    starts = fleet.starts
+    node_id = graph.nodes.index.to_numpy(np.int64)
+    via = np.where(paths.entered, node_id[states.tail[paths.state]], 0) if n_steps else np.zeros(0, np.int64)
+    counts = np.bincount(paths.trace, minlength=len(starts) - 1)
+    position = np.arange(n_steps) - np.repeat(np.cumsum(counts) - counts, counts)
+    first, last = _first_and_last_fix(paths)
+    times = fleet.traces["t"]
+    return pd.DataFrame(
+        {
+            "trace_id": fleet.traces["trace_id"].take(starts[:-1][paths.trace]).array,
+            "position": position,
+            "edge": graph.edges.index.to_numpy(np.int64)[paths.state >> 1],
+            "forward": paths.state & 1 == 0,
+            "entered": paths.entered,
+            "left": np.append(paths.entered[1:], False)[:n_steps],
+            "via_node": pd.arrays.IntegerArray(via, ~paths.entered),
+            "t_first": _times_at(times, first),
+            "t_last": _times_at(times, last),
+            "part": paths.part,
+        }
+    )
+
+
+def _first_and_last_fix(paths: Paths) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of the first and last fix on every step, -1 where there is none; shape (S,) each."""
+    first, last = np.full(len(paths.state), -1, np.int64), np.full(len(paths.state), -1, np.int64)
+    rows = np.flatnonzero(paths.step >= 0)
+    last[paths.step[rows]] = rows
+    first[paths.step[rows[::-1]]] = rows[::-1]
+    return first, last
+
+
+def _times_at(times: pd.Series, rows: NDArray[np.int64]) -> pd.Series:
+    """Return the times of fixes, NaT for row -1."""
+    taken = times.take(np.maximum(rows, 0)).reset_index(drop=True)
+    return taken.mask(rows < 0)
