@@ -11,7 +11,8 @@ import pytest
 import shapely
 
 from probe2road.errors import CRSError, InputError, OptionError, OutputError
-from probe2road.export import WRITABLE, from_networkx, read_graph, to_networkx, write_graph
+from probe2road.export import WRITABLE, read_graph, write_graph
+from probe2road.io.graph_networkx import from_networkx, to_networkx
 from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
 
 UTM = "EPSG:32616"

@@ -12,11 +12,12 @@ __version__ = "0.1.0.dev0"
 
 if TYPE_CHECKING:
     from probe2road.errors import Probe2RoadError
-    from probe2road.export import from_networkx, read_graph, to_networkx, write_graph
+    from probe2road.export import read_graph, write_graph
     from probe2road.fleet import Fleet, TraceGaps, fleet_from_tables
     from probe2road.io.fleet_reader import read_fleet
     from probe2road.io.fleet_summary import describe_fleet
     from probe2road.io.fleet_writer import write_fleet
+    from probe2road.io.graph_networkx import from_networkx, to_networkx
     from probe2road.metrics.evaluate import evaluate
     from probe2road.raster import rasterize
     from probe2road.recipe import BuildOptions, build
@@ -36,8 +37,8 @@ _HOME = {
     "graph_from_lines": "roadgraph",
     "read_graph": "export",
     "write_graph": "export",
-    "to_networkx": "export",
-    "from_networkx": "export",
+    "to_networkx": "io.graph_networkx",
+    "from_networkx": "io.graph_networkx",
     "rasterize": "raster",
     "BuildOptions": "recipe",
     "build": "recipe",

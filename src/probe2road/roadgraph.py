@@ -112,7 +112,7 @@ class RoadGraph:
 
     def to_networkx(self, *, min_count: int = 5) -> Any:
         """Return an OSMnx ``MultiDiGraph``; see `probe2road.export.to_networkx`."""
-        from probe2road.export import to_networkx
+        from probe2road.io.graph_networkx import to_networkx
 
         return to_networkx(self, min_count=min_count)
 

@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from probe2road.crs import local_crs
-from probe2road.export import from_networkx, read_graph, to_networkx, write_graph
+from probe2road.export import read_graph, write_graph
+from probe2road.io.graph_networkx import from_networkx, to_networkx
 from probe2road.roadgraph import TURN_DTYPES, RoadGraph, check_graph, graph_from_lines
 
 # Greatest displacement of a vertex, metres. Exact formats are exact to the last bit.

@@ -1,0 +1,302 @@
+"""Road graphs as NetworkX graphs of OSMnx's kind, and as GraphML."""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import Any
+from xml.etree.ElementTree import ParseError
+
+import geopandas as gpd
+import networkx as nx
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+
+from probe2road.crs import WGS84, local_crs, parse_crs, require_metric, transform
+from probe2road.errors import CRSError, InputError
+from probe2road.io.atomic import atomic_path
+from probe2road.io.graph_tables import (
+    OWN_COLUMNS,
+    crs_to_text,
+    edges_with_turns,
+    graph_from_edge_table,
+    outgoing,
+    text_value,
+    typed_column,
+)
+from probe2road.roadgraph import (
+    EDGE_DTYPES,
+    RoadGraph,
+    check_graph,
+    driving_direction,
+    empty_turns,
+    finish_edges,
+    move_ends,
+)
+
+__all__ = ["from_networkx", "read_graphml", "to_networkx", "write_graphml"]
+
+_DERIVED_NODE_COLUMNS = ("x", "y", "lon", "lat", "street_count")  # made by to_networkx, not data of ours
+_END_TOLERANCE = 0.01  # m; ends of foreign edges this near their node are moved onto it
+
+
+def to_networkx(graph: RoadGraph, *, min_count: int = 5) -> nx.MultiDiGraph:
+    """Return the graph as OSMnx has its graphs: a ``MultiDiGraph`` in the metric CRS.
+
+    An edge that is open both ways becomes two directed edges, the second with ``reversed`` true, its geometry
+    turned and its counts swapped; one-way edges become one (see `probe2road.roadgraph.driving_direction`).
+    Both carry the id in ``edge``. Missing values are left out. The result passes
+    ``osmnx.convert.validate_graph``, unless it is empty, which OSMnx does not allow.
+
+    Parameters
+    ----------
+    graph
+        The graph.
+    min_count
+        Traversals needed to call an edge one-way.
+
+    Returns
+    -------
+    networkx.MultiDiGraph
+        Nodes have ``x``, ``y`` (m), ``lon``, ``lat``, ``street_count``; edges ``osmid`` (the edge id where
+        there is none), ``length`` (m), ``oneway``, ``reversed``, ``geometry`` and the columns of the graph,
+        with the turns as text. A column ``oneway`` of the graph becomes ``oneway_tag``.
+
+    Examples
+    --------
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> directed = to_networkx(graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616"))
+    >>> sorted((u, v, data["reversed"], data["length"]) for u, v, data in directed.edges(data=True))
+    [(0, 1, False, 100.0), (1, 0, True, 100.0)]
+    """
+    result = nx.MultiDiGraph(crs=crs_to_text(graph.crs), created_with="probe2road")
+    result.add_nodes_from(zip(graph.nodes.index.tolist(), _present(_node_table(graph)), strict=True))
+
+    edges = edges_with_turns(graph)
+    edges = edges.rename(columns={"oneway": "oneway_tag"})
+    edges["osmid"] = edges["osmid"] if "osmid" in edges else edges["edge"]
+    direction = driving_direction(graph.edges, min_count=min_count).to_numpy()
+    edges["oneway"] = direction != 0
+    backward = edges.assign(
+        reversed=True,
+        geometry=shapely.reverse(edges.geometry.to_numpy()),
+        forward=edges["backward"],
+        backward=edges["forward"],
+    ).rename(columns={"u": "v", "v": "u"})
+    # Both directions of a loop join the same pair of nodes: the second needs a key of its own.
+    loop = (edges["u"] == edges["v"]).to_numpy() & (direction == 0)
+    backward.loc[loop, "key"] += edges["key"].max() + 1 if loop.any() else 0
+    for table in (edges.assign(reversed=False)[direction >= 0], backward[direction <= 0]):
+        ends = (table[name].tolist() for name in ("u", "v", "key"))
+        attributes = _present(pd.DataFrame(table.drop(columns=["u", "v", "key"])))
+        result.add_edges_from(zip(*ends, attributes, strict=True))
+    return result
+
+
+def _node_table(graph: RoadGraph) -> pd.DataFrame:
+    position = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
+    lon, lat = transform(position[:, 0], position[:, 1], graph.crs, WGS84)
+    return pd.DataFrame(graph.nodes.drop(columns="geometry")).assign(
+        x=position[:, 0], y=position[:, 1], lon=lon, lat=lat, street_count=graph.degrees()
+    )
+
+
+def _present(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return rows as dictionaries of Python values, without what is missing."""
+    columns = {str(name): table[name].astype(object).tolist() for name in table}
+    there = {str(name): table[name].notna().tolist() for name in table}
+    return [{name: columns[name][row] for name in columns if there[name][row]} for row in range(len(table))]
+
+
+def from_networkx(graph: nx.Graph, *, target_crs: Any = None) -> RoadGraph:
+    """Return the road graph of a NetworkX graph made by `to_networkx` or OSMnx.
+
+    Of a foreign graph, two directed edges with the same geometry become one edge open both ways; edges without
+    geometry are straight; lists of values become text, separated by ``;``; edges without extent are left out.
+
+    Parameters
+    ----------
+    graph
+        Nodes with integer ids, ``x`` and ``y``; the CRS in ``graph.graph["crs"]``.
+    target_crs
+        Metric CRS to work in; otherwise the graph's own, or, for degrees, the local one.
+
+    Raises
+    ------
+    InputError
+        If nodes lack coordinates or integer ids, or an invariant is broken.
+    CRSError
+        If there is no CRS, or the target is not metric.
+
+    Examples
+    --------
+    >>> foreign = nx.MultiDiGraph(crs="EPSG:32616")
+    >>> foreign.add_nodes_from([(7, {"x": 0, "y": 0}), (9, {"x": 30, "y": 40})])
+    >>> foreign.add_edges_from([(7, 9, {"highway": "service"}), (9, 7, {"highway": "service"})])
+    [0, 0]
+    >>> from_networkx(foreign).edges[["u", "v", "length", "highway"]].values.tolist()
+    [[7, 9, 50.0, 'service']]
+    """
+    source = parse_crs(graph.graph["crs"], where="NetworkX graph") if "crs" in graph.graph else None
+    if source is None:
+        raise CRSError("has no CRS", where="NetworkX graph", fix="set graph.graph['crs']")
+    nodes = _nodes_from_networkx(graph, source)
+    rows = [
+        {**data, "u": u, "v": v, "key": key} for u, v, key, data in nx.MultiDiGraph(graph).edges(keys=True, data=True)
+    ]
+    table = pd.DataFrame(rows, columns=None if rows else [*OWN_COLUMNS, "geometry"])
+    lines = _drawn(table, nodes)
+    edges = gpd.GeoDataFrame(table.drop(columns="geometry", errors="ignore"), geometry=lines, crs=source)
+    if target_crs is None:
+        x, y = nodes.geometry.x.to_numpy(), nodes.geometry.y.to_numpy()
+        target_crs = local_crs(x, y) if source.is_geographic else source
+    target = require_metric(parse_crs(target_crs), where="NetworkX graph")
+    nodes, edges = (part if source == target else part.to_crs(target) for part in (nodes, edges))
+    if set(OWN_COLUMNS) <= set(edges):
+        edges = _one_edge_per_id(edges)
+        return graph_from_edge_table(edges, nodes=nodes.reset_index(), where="NetworkX graph")
+    return _from_foreign(nodes, edges)
+
+
+def _nodes_from_networkx(graph: nx.Graph, crs: Any) -> gpd.GeoDataFrame:
+    """Return the node table, in the CRS of the graph."""
+    table = pd.DataFrame([data for _, data in graph.nodes(data=True)])
+    if not {"x", "y"} <= set(table) and len(graph):
+        raise InputError("nodes have no x and y", where="NetworkX graph", fix="set their coordinates")
+    ids = list(graph.nodes)
+    if not all(isinstance(node, int | np.integer) for node in ids):
+        raise InputError("node ids are not integers", where="NetworkX graph", fix="renumber the nodes")
+    points = shapely.points(table["x"], table["y"]) if len(table) else np.zeros(0, object)
+    further = table.drop(columns=[*_DERIVED_NODE_COLUMNS, "geometry"], errors="ignore").map(_single_value)
+    return gpd.GeoDataFrame(further, geometry=points, crs=crs).set_index(pd.Index(ids, name="node", dtype="int64"))
+
+
+def _drawn(table: pd.DataFrame, nodes: gpd.GeoDataFrame) -> NDArray[Any]:
+    """Return the geometry of every directed edge, straight where it has none."""
+    position = nodes.get_coordinates().to_numpy()
+    u, v = (position[nodes.index.get_indexer(table[end])] for end in ("u", "v"))
+    straight = shapely.linestrings(np.stack([u, v], axis=1)) if len(table) else np.zeros(0, object)
+    if "geometry" not in table:
+        return straight
+    given = table["geometry"].to_numpy(dtype=object)
+    return np.where(pd.notna(given), given, straight)
+
+
+def _one_edge_per_id(edges: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """Undo the two directions of `to_networkx`: one row per ``edge``, turned back where only the reverse is there."""
+    edges = edges.sort_values("reversed", kind="stable").drop_duplicates("edge") if len(edges) else edges
+    turned = edges.get("reversed", pd.Series(False, edges.index)).to_numpy(bool)
+    lines = edges.geometry.to_numpy()
+    forward, backward = (edges.get(name, pd.Series(pd.NA, edges.index)) for name in ("forward", "backward"))
+    result = edges.assign(
+        u=edges["u"].where(~turned, edges["v"]),
+        v=edges["v"].where(~turned, edges["u"]),
+        forward=forward.where(~turned, backward),
+        backward=backward.where(~turned, forward),
+    ).set_geometry(np.where(turned, shapely.reverse(lines), lines), crs=edges.crs)
+    if "osmid" in result and (result["osmid"] == result["edge"]).all():
+        result = result.drop(columns="osmid")
+    return result.drop(columns=["oneway", "reversed"], errors="ignore").rename(columns={"oneway_tag": "oneway"})
+
+
+def _from_foreign(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame) -> RoadGraph:
+    """Make one edge of the two directions of a road in an OSMnx graph."""
+    low, high = edges[["u", "v"]].min(axis=1), edges[["u", "v"]].max(axis=1)
+    shape = shapely.to_wkb(shapely.normalize(edges.geometry.to_numpy()))
+    twins = pd.DataFrame({"low": low, "high": high, "shape": shape})
+    single = ~twins.duplicated(keep=False)
+    edges = edges[~twins.duplicated()]
+    if "oneway" in edges:
+        edges = edges.assign(oneway=edges["oneway"].map(_flag) & single[edges.index])
+
+    position = nodes.get_coordinates().to_numpy()
+    u, v = (position[nodes.index.get_indexer(edges[end])] for end in ("u", "v"))
+    lines = _towards(edges.geometry.to_numpy(), u)
+    first, last = (shapely.get_coordinates(shapely.get_point(lines, end)) for end in (0, -1))
+    near = [np.hypot(*(ends - place).T)[:, None] <= _END_TOLERANCE for ends, place in ((first, u), (last, v))]
+    lines = move_ends(lines, np.where(near[0], u, first), np.where(near[1], v, last))
+    edges = edges.set_geometry(lines, crs=edges.crs)[shapely.length(lines) > 0]
+
+    own = [name for name in (*EDGE_DTYPES, "edge", "reversed", "from", "to") if name not in ("u", "v")]
+    further = edges.drop(columns=own, errors="ignore").reset_index(drop=True)
+    for column in further.columns.drop(["u", "v", "geometry"]):
+        further[column] = further[column].map(_single_value)
+    graph = RoadGraph(nodes, finish_edges(further.assign(origin="reference")), empty_turns())
+    check_graph(graph, where="NetworkX graph")
+    return graph
+
+
+def _towards(lines: NDArray[Any], u: NDArray[np.float64]) -> NDArray[Any]:
+    """Turn lines that start nearer to their end node: undirected graphs do not keep the order."""
+    first, last = (shapely.get_coordinates(shapely.get_point(lines, end)) for end in (0, -1))
+    turned = np.hypot(*(last - u).T) < np.hypot(*(first - u).T)
+    return np.where(turned, shapely.reverse(lines), lines)
+
+
+def _flag(value: Any) -> bool:
+    return value is True or str(value).lower() in ("true", "yes", "1")
+
+
+def _single_value(value: Any) -> Any:
+    """Join a list of values, as OSMnx has them on simplified edges, the way OSM does."""
+    return ";".join(map(str, value)) if isinstance(value, list | tuple | set) else value
+
+
+def write_graphml(graph: RoadGraph, path: str | PathLike[str]) -> None:
+    """Write GraphML that ``osmnx.io.load_graphml`` reads: the graph of `to_networkx`, values as text.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written or the graph holds private columns.
+    """
+    directed = to_networkx(outgoing(graph, where=path))
+    text = nx.MultiDiGraph(**directed.graph)
+    text.add_nodes_from((node, _as_text(data)) for node, data in directed.nodes(data=True))
+    text.add_edges_from((u, v, key, _as_text(data)) for u, v, key, data in directed.edges(keys=True, data=True))
+    with atomic_path(path) as temporary:
+        nx.write_graphml(text, temporary)
+
+
+def _as_text(data: dict[str, Any]) -> dict[str, str | None]:
+    """Return attributes as text, geometry as WKT that holds every digit."""
+    return {
+        name: shapely.to_wkt(value, rounding_precision=-1) if isinstance(value, shapely.Geometry) else text_value(value)
+        for name, value in data.items()
+    }
+
+
+def read_graphml(path: str | PathLike[str], *, target_crs: Any = None) -> RoadGraph:
+    """Read GraphML written by `write_graphml` or ``osmnx.io.save_graphml``.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged, or is not a graph with coordinates.
+    CRSError
+        If it names no CRS.
+    """
+    try:
+        text = nx.read_graphml(path, node_type=int, force_multigraph=True)
+    except (ParseError, nx.NetworkXError, ValueError, KeyError) as error:
+        raise InputError(f"cannot be read as GraphML ({error})", where=path, fix="check that it is complete") from error
+    typed = nx.MultiDiGraph(**text.graph)
+    typed.add_nodes_from(zip(text.nodes, _typed_rows([data for _, data in text.nodes(data=True)]), strict=True))
+    edges = list(text.edges(keys=True, data=True))
+    rows = _typed_rows([{name: data[name] for name in data if name != "id"} for *_, data in edges])
+    typed.add_edges_from((u, v, key, row) for (u, v, key, _), row in zip(edges, rows, strict=True))
+    return from_networkx(typed, target_crs=target_crs)
+
+
+def _typed_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Bring text attributes back to numbers, flags and geometry, column by column."""
+    if not rows:
+        return []
+    table = pd.DataFrame(rows, index=pd.RangeIndex(len(rows)))
+    for column in table:
+        values = table[column]
+        table[column] = (
+            shapely.from_wkt(values.where(values.notna(), None)) if column == "geometry" else typed_column(values)
+        )
+    return _present(table)
