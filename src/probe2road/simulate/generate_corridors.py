@@ -11,6 +11,7 @@ from probe2road.simulate.generate_roads import Road, carriageway, ramp, split_at
 __all__ = ["draw_corridor"]
 
 _RAMP = 280.0  # m along the motorway from a gore to the road beside it
+_JOINT = np.radians(7.0)  # between a ramp and the road beside, so that neither bend makes them cross
 _SPACING = 900.0  # m between the places where ramps may be
 
 
@@ -43,11 +44,11 @@ def _side(rng: np.random.Generator, path: Path, lanes: int, kind: str) -> list[R
     joints = []
     for gore in out:
         s = _nearest(beside, gore.lane.x, gore.lane.y) + _RAMP
-        roads.append(ramp(hermite(gore.lane, along(beside, s)), gore))
+        roads.append(ramp(hermite(gore.lane, along(beside, s).turned(-_JOINT)), gore))
         joints.append(s)
     for gore in into:
         s = _nearest(beside, gore.lane.x, gore.lane.y) - _RAMP
-        roads.append(ramp(hermite(along(beside, s), gore.lane), None, gore))
+        roads.append(ramp(hermite(along(beside, s).turned(_JOINT), gore.lane), None, gore))
         joints.append(s)
     return roads + split_at(line, joints)
 
@@ -68,10 +69,10 @@ def _across(rng: np.random.Generator, axis: Path) -> list[Road]:
 
 
 def _apart(roads: list[Road]) -> list[Road]:
-    """Leave out overpasses that would meet the one before."""
+    """Leave out overpasses that would meet one that is kept."""
     kept: list[Road] = []
     for road in roads:
-        ends = [other.line[[0, -1]] for other in kept[-1:]]
+        ends = [other.line[[0, -1]] for other in kept]
         if all(not _cross(road.line[[0, -1]], segment) for segment in ends):
             kept.append(road)
     return kept

@@ -32,6 +32,10 @@ class Pose:
         c, s = np.cos(self.heading), np.sin(self.heading)
         return Pose(float(self.x + ahead * c + right * s), float(self.y + ahead * s - right * c), self.heading)
 
+    def turned(self, left: float) -> Pose:
+        """Return the pose turned to the left (rad)."""
+        return Pose(self.x, self.y, self.heading + left)
+
     @property
     def xy(self) -> Path:
         """Position, shape ``(2,)``."""

@@ -284,8 +284,10 @@ def _weaving(rng: np.random.Generator) -> list[Road]:
 def _roundabout(rng: np.random.Generator) -> list[Road]:
     arms, radius = int(rng.integers(3, 6)), rng.uniform(18, 32)
     spread = 2 * np.pi / arms
-    angles = np.arange(arms) * spread + rng.uniform(-0.15, 0.15, arms) * spread + rng.uniform(0, 2 * np.pi)
-    opening = np.arcsin(min(9.0 / radius, 0.5))  # half the angle between the exit and the entry of an arm
+    angles = np.arange(arms) * spread + rng.uniform(-0.1, 0.1, arms) * spread + rng.uniform(0, 2 * np.pi)
+    opening = min(
+        np.arcsin(min(9.0 / radius, 0.5)), 0.27 * spread
+    )  # half the angle between the exit and the entry of an arm
     roads: list[Road] = []
     stops = np.sort(np.concatenate([angles - opening, angles + opening]))
     for begin, end in zip(stops, np.append(stops[1:], stops[0] + 2 * np.pi), strict=True):
