@@ -13,6 +13,7 @@ algebra: smooth, locally accurate, metre-level absolute.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -96,76 +97,110 @@ def fuse(
     FusedPoses
         A continuous line: from pose to pose the error moves by centimetres.
     """
-    n = len(poses.t)
+    bias = fusion.vehicle_bias * vehicle_rng.standard_normal(3)
+    tuning = _tuning(odometry, fusion, rng)
     steps = np.diff(poses.t, prepend=poses.t[:1])
     driven = np.diff(poses.distance, prepend=poses.distance[:1])
-    bias = fusion.vehicle_bias * vehicle_rng.standard_normal(3)
-    scale = odometry.scale_sigma * rng.standard_normal()
-    gyro = np.radians(odometry.gyro_bias) * rng.standard_normal()
-    error, turned, sigma = _filter(
-        steps, driven, poses.heading, covered, gnss.error, gnss.sigma, scale, gyro,
-        np.radians(odometry.heading_sigma), odometry.heading_time, np.radians(odometry.gyro_walk),
-        odometry.height_walk, fusion.pull_time, fusion.vertical_pull_time, fusion.gate, fusion.trusted_sigma,
-        fusion.min_trust, rng.standard_normal((n, 3)),
-    )  # fmt: skip
+    fresh = rng.standard_normal((len(poses.t), 3))
+    turned = _heading_error(steps, covered, tuning, fresh)
+    error, sigma = _position_error(
+        steps, driven, poses.heading, turned, covered, gnss.error, gnss.sigma, tuning, fresh[:, 2]
+    )
     return FusedPoses(poses.xyz + error + bias, poses.heading + turned, sigma)
 
 
+class _Tuning(NamedTuple):
+    """Both models with the constants of one drive drawn, in radians, in a form that compiled code can take."""
+
+    scale: float  # error of the distance driven
+    gyro: float  # radians/s
+    gyro_walk: float  # radians per square root of a second
+    heading_sigma: float  # radians
+    heading_time: float  # s
+    height_walk: float  # m per square root of a metre
+    pull_time: float  # s
+    vertical_pull_time: float  # s
+    gate: float  # m
+    trusted_sigma: float  # m
+    min_trust: float
+
+
+def _tuning(odometry: OdometryModel, fusion: FusionModel, rng: np.random.Generator) -> _Tuning:
+    """Draw what is constant over a drive."""
+    return _Tuning(
+        scale=odometry.scale_sigma * float(rng.standard_normal()),
+        gyro=float(np.radians(odometry.gyro_bias) * rng.standard_normal()),
+        gyro_walk=float(np.radians(odometry.gyro_walk)),
+        heading_sigma=float(np.radians(odometry.heading_sigma)),
+        heading_time=odometry.heading_time,
+        height_walk=odometry.height_walk,
+        pull_time=fusion.pull_time,
+        vertical_pull_time=fusion.vertical_pull_time,
+        gate=fusion.gate,
+        trusted_sigma=fusion.trusted_sigma,
+        min_trust=fusion.min_trust,
+    )
+
+
 @njit(cache=True)
-def _filter(
-    steps: NDArray[np.float64],
-    driven: NDArray[np.float64],
-    heading: NDArray[np.float64],
-    covered: NDArray[np.bool_],
-    gnss: NDArray[np.float64],
-    gnss_sigma: NDArray[np.float64],
-    scale: float,
-    gyro: float,
-    heading_sigma: float,
-    heading_time: float,
-    gyro_walk: float,
-    height_walk: float,
-    pull_time: float,
-    vertical_pull_time: float,
-    gate: float,
-    trusted_sigma: float,
-    min_trust: float,
-    normal: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Run the filter: position error ``(n, 3)``, heading error ``(n,)`` in radians, own sigma ``(n,)``."""
-    n = len(steps)
-    error, turned, sigma = np.zeros((n, 3)), np.zeros(n), np.zeros(n)
-    e = np.zeros(3)
-    weave, drift, own = heading_sigma * normal[0, 0], 0.0, min(gnss_sigma[0], gate)
-    if n:
-        # The filter has run before the drive begins, so it starts near the GNSS error, in a tunnel too.
-        size = np.hypot(gnss[0, 0], gnss[0, 1])
-        e[:] = gnss[0] * min(1.0, gate / max(size, 1e-9))
-        e[2] = min(max(gnss[0, 2], -2.0 * gate), 2.0 * gate)
-    for i in range(n):
-        h, way = steps[i], driven[i]
-        fade = np.exp(-h / heading_time)
-        weave = fade * weave + heading_sigma * np.sqrt(1.0 - fade * fade) * normal[i, 0]
+def _heading_error(
+    steps: NDArray[np.float64], covered: NDArray[np.bool_], tuning: _Tuning, normal: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the heading error (radians): a Gauss-Markov process, and the drift of a gyroscope while GNSS is away."""
+    turned = np.zeros(len(steps))
+    weave, drift = 0.0, 0.0
+    for i in range(len(steps)):
+        fade = np.exp(-steps[i] / tuning.heading_time) if i > 0 else 0.0
+        weave = fade * weave + tuning.heading_sigma * np.sqrt(1.0 - fade * fade) * normal[i, 0]
         if covered[i]:
-            drift += gyro * h + gyro_walk * np.sqrt(h) * normal[i, 1]
+            drift += tuning.gyro * steps[i] + tuning.gyro_walk * np.sqrt(steps[i]) * normal[i, 1]
         else:
             drift *= fade
         turned[i] = weave + drift
+    return turned
+
+
+@njit(cache=True)
+def _position_error(
+    steps: NDArray[np.float64],
+    driven: NDArray[np.float64],
+    heading: NDArray[np.float64],
+    turned: NDArray[np.float64],
+    covered: NDArray[np.bool_],
+    gnss: NDArray[np.float64],
+    gnss_sigma: NDArray[np.float64],
+    tuning: _Tuning,
+    normal: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the position error ``(n, 3)`` and the filter's own idea of it ``(n,)``, m."""
+    error, sigma = np.zeros((len(steps), 3)), np.zeros(len(steps))
+    x, y, z, own = 0.0, 0.0, 0.0, 0.0
+    if len(steps):
+        # The filter has run before the drive begins, so it starts near the GNSS error, in a tunnel too.
+        near = min(1.0, tuning.gate / max(np.hypot(gnss[0, 0], gnss[0, 1]), 1e-9))
+        x, y, z = near * gnss[0, 0], near * gnss[0, 1], _clipped(gnss[0, 2], 2.0 * tuning.gate)
+        own = min(gnss_sigma[0], tuning.gate)
+    for i in range(len(steps)):
         sin, cos = np.sin(heading[i]), np.cos(heading[i])
-        e[0] += way * (scale * sin + turned[i] * cos)
-        e[1] += way * (scale * cos - turned[i] * sin)
-        e[2] += height_walk * np.sqrt(way) * normal[i, 2]
-        own += 0.5 * way * (heading_sigma + abs(scale)) if covered[i] else 0.0
-        if not covered[i]:
-            trust = max(min((trusted_sigma / gnss_sigma[i]) ** 2, 1.0), min_trust)
-            pull = 1.0 - np.exp(-h * trust / pull_time)
-            dx, dy = gnss[i, 0] - e[0], gnss[i, 1] - e[1]
-            pull *= min(1.0, gate / max(np.hypot(dx, dy), 1e-9))
-            e[0] += pull * dx
-            e[1] += pull * dy
-            dz = min(max(gnss[i, 2] - e[2], -2.0 * gate), 2.0 * gate)
-            e[2] += (1.0 - np.exp(-h * trust / vertical_pull_time)) * dz
-            own += pull * (min(gnss_sigma[i], 3.0 * gate) - own)
-        error[i] = e
-        sigma[i] = own
-    return error, turned, sigma
+        x += driven[i] * (tuning.scale * sin + turned[i] * cos)
+        y += driven[i] * (tuning.scale * cos - turned[i] * sin)
+        z += tuning.height_walk * np.sqrt(driven[i]) * normal[i]
+        if covered[i]:
+            own += 0.5 * driven[i] * (tuning.heading_sigma + abs(tuning.scale))
+        else:
+            trust = max(min((tuning.trusted_sigma / gnss_sigma[i]) ** 2, 1.0), tuning.min_trust)
+            away = np.hypot(gnss[i, 0] - x, gnss[i, 1] - y)
+            pull = 1.0 - np.exp(-steps[i] * trust / tuning.pull_time)
+            pull *= min(1.0, tuning.gate / max(away, 1e-9))
+            x, y = x + pull * (gnss[i, 0] - x), y + pull * (gnss[i, 1] - y)
+            rise = 1.0 - np.exp(-steps[i] * trust / tuning.vertical_pull_time)
+            z += rise * _clipped(gnss[i, 2] - z, 2.0 * tuning.gate)
+            own += pull * (min(gnss_sigma[i], 3.0 * tuning.gate) - own)
+        error[i, 0], error[i, 1], error[i, 2], sigma[i] = x, y, z, own
+    return error, sigma
+
+
+@njit(cache=True)
+def _clipped(value: float, limit: float) -> float:
+    """Clip to ``[-limit, limit]``."""
+    return min(max(value, -limit), limit)

@@ -161,23 +161,38 @@ def _sample_links(
                 vertex += 1
             while not forward and vertex > first and vertex_along[vertex] > at:
                 vertex -= 1
-            run = vertex_along[vertex + 1] - vertex_along[vertex]
-            share = (at - vertex_along[vertex]) / run if run > 0 else 0.0
-            tx = vertex_tangent[vertex, 0] * (1 - share) + vertex_tangent[vertex + 1, 0] * share
-            ty = vertex_tangent[vertex, 1] * (1 - share) + vertex_tangent[vertex + 1, 1] * share
-            size = max(np.hypot(tx, ty), 1e-9) * (1.0 if forward else -1.0)
-            tx, ty = tx / size, ty / size
+            row = indptr[i] + k
+            _place(xyz, vertex_tangent, vertex_along, vertex, at, forward, points[row], tangent[row])
             old = _lane_offset(lane_shape[lane + entered[i]], s, length)
             new = _lane_offset(lane_shape[lane + left[i]], s, length)
             moved = _smooth_step((s - change[i, 0]) / max(change[i, 1] - change[i, 0], 1e-6))
             offset = old + (new - old) * moved
-            row = indptr[i] + k
-            for axis in range(3):
-                points[row, axis] = xyz[vertex, axis] * (1 - share) + xyz[vertex + 1, axis] * share
-            points[row, 0] += offset * ty
-            points[row, 1] -= offset * tx
-            tangent[row, 0], tangent[row, 1], along[row] = tx, ty, s
+            points[row, 0] += offset * tangent[row, 1]
+            points[row, 1] -= offset * tangent[row, 0]
+            along[row] = s
     return points, tangent, along
+
+
+@njit(cache=True)
+def _place(
+    xyz: NDArray[np.float64],
+    vertex_tangent: NDArray[np.float64],
+    vertex_along: NDArray[np.float64],
+    vertex: int,
+    at: float,
+    forward: bool,
+    point: NDArray[np.float64],
+    tangent: NDArray[np.float64],
+) -> None:
+    """Write the point of a section line behind a vertex, and its unit driving direction."""
+    run = vertex_along[vertex + 1] - vertex_along[vertex]
+    share = (at - vertex_along[vertex]) / run if run > 0 else 0.0
+    for axis in range(3):
+        point[axis] = xyz[vertex, axis] * (1 - share) + xyz[vertex + 1, axis] * share
+    for axis in range(2):
+        tangent[axis] = vertex_tangent[vertex, axis] * (1 - share) + vertex_tangent[vertex + 1, axis] * share
+    size = max(np.hypot(tangent[0], tangent[1]), 1e-9) * (1.0 if forward else -1.0)
+    tangent[0], tangent[1] = tangent[0] / size, tangent[1] / size
 
 
 @njit(cache=True)
