@@ -19,10 +19,10 @@ import time
 from pathlib import Path
 
 import pandas as pd
-from probe2road.picture import draw_graph
 
 from probe2road import evaluate, read_fleet, read_graph
 from probe2road.metrics import GeoOptions
+from probe2road.picture import draw_graph
 from probe2road.roadgraph import RoadGraph, graph_from_lines
 
 CITIES = {"chicago_shuttle": ("EPSG:32616", "trace_id=trip"), "athens_small": ("EPSG:2100", "trace_id=trip")}
