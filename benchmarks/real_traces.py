@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -29,7 +30,7 @@ CITIES = {"chicago_shuttle": ("EPSG:32616", "trace_id=trip"), "athens_small": ("
 MIN_TRIPS = 4  # trips near an edge from which the reference counts as sufficiently driven
 
 # F at 5, 10, 15 and 20 m against gt_traversed_tang, as published.
-BUFFER_GEO = {
+BUFFER_GEO: dict[str, dict[str, tuple[float | None, float, float, float, float]]] = {
     "chicago_shuttle": {
         "Tang 2019": (33.5, 0.589, 0.771, 0.883, 0.925),
         "CellNet 2018": (36.3, 0.488, 0.702, 0.816, 0.881),
@@ -50,7 +51,7 @@ BUFFER_GEO = {
     },
 }
 # F at 5, 10 and 15 m against gt_traversed_graph, as published.
-GRAPH_SAMPLING = {
+GRAPH_SAMPLING: dict[str, dict[str, tuple[float, float, float]]] = {
     "chicago_shuttle": {
         "Biagioni 2012": (0.501, 0.610, 0.641),
         "Tang 2019": (0.467, 0.649, 0.727),
@@ -93,8 +94,8 @@ def report(city: str, folder: Path, pictures: Path | None) -> None:
     ours = evaluate(graph, traversed, metrics=["graph_sampling"])
     print("\n| graph sampling | 5 m | 10 m | 15 m |\n|---|---|---|---|")
     print(f"| **probe2road, density** | {' | '.join(triples(ours))} |")
-    for name, scores in GRAPH_SAMPLING[city].items():
-        print(f"| {name} | {' | '.join(f'{score:.3f}' for score in scores)} |")
+    for name, published in GRAPH_SAMPLING[city].items():
+        print(f"| {name} | {' | '.join(f'{score:.3f}' for score in published)} |")
 
     references = {"gt_traversed_tang": lines, "gt_traversed_graph": traversed}
     if "trips_near" in traversed.edges:
@@ -110,7 +111,7 @@ def report(city: str, folder: Path, pictures: Path | None) -> None:
 
 def own_metrics(graph: RoadGraph, references: dict[str, RoadGraph]) -> None:
     """Print the metrics of this project against several references."""
-    metrics = ["geo", GeoOptions(radius=15.0), "topo", "itopo", "apls", "buffer_geo", "graph_sampling"]
+    metrics: list[Any] = ["geo", GeoOptions(radius=15.0), "topo", "itopo", "apls", "buffer_geo", "graph_sampling"]
     tables = {name: evaluate(graph, reference, metrics=metrics) for name, reference in references.items()}
     print(f"\n| metric, F/P/R | {' | '.join(tables)} |\n|---|{'---|' * len(tables)}")
     first = next(iter(tables.values()))

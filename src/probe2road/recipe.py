@@ -43,10 +43,10 @@ class BuildOptions:
 
     resolution: float = 1.0  # m per pixel
     segmenter: str = "density"  # one of SEGMENTERS
-    gaps: TraceGaps = field(default_factory=TraceGaps)
-    density: DensityOptions = field(default_factory=DensityOptions)
-    vectorize: VectorizeOptions = field(default_factory=VectorizeOptions)
-    clean: CleanOptions = field(default_factory=CleanOptions)
+    gaps: TraceGaps = field(default_factory=TraceGaps)  # where traces are broken
+    density: DensityOptions = field(default_factory=DensityOptions)  # of the density segmenter
+    vectorize: VectorizeOptions = field(default_factory=VectorizeOptions)  # how pixels become lines
+    clean: CleanOptions = field(default_factory=CleanOptions)  # what counts as a flaw
 
     def __post_init__(self) -> None:
         """Refuse an unknown segmenter."""

@@ -59,7 +59,7 @@ class DensityOptions:
     half_presence: float = 0.3  # traces close by at which it is one half
     half_ridge: float = 0.3  # relative curvature at which it is one half
     threshold: float = 0.5  # probability that continues a road
-    seed_threshold: float = 0.67  # probability that starts one: two traces on a ridge
+    seed_threshold: float = 0.67  # probability that starts one: three traces on a ridge
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing."""

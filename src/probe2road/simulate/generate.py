@@ -23,7 +23,8 @@ __all__ = ["INTERCHANGES", "generate_corridor", "generate_interchange", "generat
 logger = logging.getLogger(__name__)
 
 INTERCHANGES = tuple(DRAWINGS)
-_CRS = "EPSG:32632"  # where the generated roads lie: at the origin of a zone, far from any real road
+# True to scale where the roads are drawn, around its origin; out at sea, far from any real road.
+_CRS = "+proj=tmerc +lat_0=0 +lon_0=9 +datum=WGS84 +units=m +type=crs"
 _SHALLOW = (15.0, 90.0)  # degrees
 
 
