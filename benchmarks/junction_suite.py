@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,6 +21,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from probe2road.disambiguate import DisambiguateOptions, split_false_junctions
 from probe2road.fleet import Fleet
+from probe2road.fleet_tables import empty_points
 from probe2road.gaps import fill_gaps, gap_weights, prune_gaps
 from probe2road.mapmatch import Matches, match
 from probe2road.passages import junction_altitudes
@@ -186,14 +188,14 @@ def drive_movements(network: RoadNetwork, preset: str, count: int, *, seed: int)
         tables.append(drive_tables(one.traffic.graph, one.section_id, labels, poses, recorded, None)["traces"])
         repetition[drive] = k
     traces = pd.concat(tables, ignore_index=True)
-    points = pd.DataFrame({"trace_id": [], "t": [], "x": [], "y": [], "z": [], "kind": []})
-    return Fleet(traces, points, network.crs), pd.Series(repetition)
+    return Fleet(traces, empty_points(traces["trace_id"]), network.crs), pd.Series(repetition)
 
 
-def confusion(graph: RoadGraph, truth: pd.DataFrame) -> tuple[int, int, int]:
+def confusion(graph: RoadGraph, plan: PlanGraph) -> tuple[int, int, int]:
     """Count true positives, false positives and false negatives of connected pairs of ends."""
-    node = end_nodes(graph.edges["u"].to_numpy(), graph.edges["v"].to_numpy())
-    said = node[truth["one"]] == node[truth["other"]]
+    ends = graph.edges[["u", "v"]].reindex(plan.graph.edges.index, fill_value=-1).to_numpy().reshape(-1)
+    truth = plan.truth
+    said = (ends[truth["one"]] == ends[truth["other"]]) & (ends[truth["one"]] >= 0)
     true = truth["connected"].to_numpy()
     return int((said & true).sum()), int((said & ~true).sum()), int((~said & true).sum())
 
@@ -221,8 +223,88 @@ def score_plan(name: str, preset: str, counts: Iterable[int], *, seed: int) -> p
                 split = split_false_junctions(
                     plan.graph, steps, heights=known if with_heights else None, options=options
                 )
-            rows.append((name, preset, seed, k, variant, *confusion(split, plan.truth)))
+            rows.append((name, preset, seed, k, variant, *confusion(split, plan)))
     return pd.DataFrame(rows, columns=["kind", "preset", "seed", "drives", "variant", "tp", "fp", "fn"])
+
+
+def score_builds(name: str, preset: str, counts: Iterable[int], *, seed: int) -> pd.DataFrame:
+    """Score every variant on whole builds of one network: density, gaps filled and pruned, junctions split."""
+    network = network_of(name, seed)
+    plan = plan_graph(network)
+    arms = _arms(plan)
+    fleet, repetition = drive_movements(network, preset, max(counts), seed=seed)
+    rows = []
+    for k in counts:
+        chosen = fleet.traces["trace_id"].map(repetition) < k
+        some = replace(fleet, traces=fleet.traces[chosen].reset_index(drop=True))
+        built = build(some)
+        filled = fill_gaps(built)
+        joined = prune_gaps(filled, match(some, filled, edge_weights=gap_weights(filled)).steps)
+        matches = match(some, joined)
+        heights = junction_altitudes(some, matches, joined)
+        graphs = {"segmentation": built}
+        for variant, (options, with_heights) in VARIANTS.items():
+            graphs[variant] = joined
+            if options is not None:
+                graphs[variant] = split_false_junctions(
+                    joined, matches.steps, heights=heights if with_heights else None, options=options
+                )
+        rows += [(name, preset, seed, k, what, *_met(graph, arms, plan.truth)) for what, graph in graphs.items()]
+    return pd.DataFrame(rows, columns=["kind", "preset", "seed", "drives", "variant", "tp", "fp", "fn"])
+
+
+def _arms(plan: PlanGraph) -> pd.DataFrame:
+    """Return a place on every edge end at a junction, and the direction there: end, x, y, dx, dy, reach (m)."""
+    ends = np.unique(plan.truth[["one", "other"]])
+    lines = plan.graph.edges.geometry.to_numpy()[ends // 2]
+    length = shapely.length(lines)
+    reach = np.minimum(_ARM, length / 2)
+    along = np.where(ends % 2 == 0, reach, length - reach)
+    here, next_ = (shapely.get_coordinates(shapely.line_interpolate_point(lines, at)) for at in (along, along + 0.5))
+    vector = (next_ - here) / np.hypot(*(next_ - here).T)[:, None]
+    columns = {"x": here[:, 0], "y": here[:, 1], "dx": vector[:, 0], "dy": vector[:, 1], "reach": reach}
+    return pd.DataFrame(columns, index=ends)
+
+
+def _met(graph: RoadGraph, arms: pd.DataFrame, truth: pd.DataFrame) -> tuple[int, int, int]:
+    """Count true and false positives and false negatives: arms that a short way in the graph joins."""
+    place = {end: _place(graph, arm) for end, arm in zip(arms.index, arms.itertuples(), strict=True)}
+    row = {node: number for number, node in enumerate(graph.nodes.index)}
+    u, v = (graph.edges[end].map(row).to_numpy(np.int64) for end in ("u", "v"))
+    length = graph.edges["length"].to_numpy()
+    shortest = pd.DataFrame({"u": u, "v": v, "m": length}).groupby(["u", "v"])["m"].min()
+    at = tuple(shortest.index.get_level_values(level).to_numpy() for level in (0, 1))
+    way = dijkstra(coo_array((shortest.to_numpy(), at), shape=(len(row), len(row))), directed=False)
+
+    def joined(one: int, other: int) -> bool:
+        first, second = place[one], place[other]
+        if first is None or second is None:
+            return False
+        (i, s), (j, t) = first, second
+        ways = [abs(s - t)] if i == j else []
+        for a, from_a in ((u[i], s), (v[i], length[i] - s)):
+            ways += [from_a + way[a, b] + from_b for b, from_b in ((u[j], t), (v[j], length[j] - t))]
+        return bool(min(ways) <= 1.5 * (arms["reach"][one] + arms["reach"][other]) + 20.0)
+
+    said = np.array([joined(*pair) for pair in truth[["one", "other"]].to_numpy()])
+    true = truth["connected"].to_numpy()
+    return int((said & true).sum()), int((said & ~true).sum()), int((~said & true).sum())
+
+
+def _place(graph: RoadGraph, arm: Any) -> tuple[int, float] | None:
+    """Find the edge that runs by an arm, its row and how far along (m), or nothing."""
+    lines = graph.edges.geometry.to_numpy()
+    point = shapely.Point(arm.x, arm.y)
+    distance = shapely.distance(lines, point)
+    for row in np.argsort(distance, kind="stable"):
+        if distance[row] > _ARM_REACH:
+            break
+        along = float(shapely.line_locate_point(lines[row], point))
+        a, b = (shapely.get_coordinates(lines[row].interpolate(max(along + d, 0.0)))[0] for d in (-2.0, 2.0))
+        cosine = abs(float((b - a) @ [arm.dx, arm.dy])) / max(float(np.hypot(*(b - a))), 1e-9)
+        if cosine >= np.cos(np.radians(_ARM_ANGLE)):
+            return int(row), along
+    return None
 
 
 def with_scores(counted: pd.DataFrame, by: list[str]) -> pd.DataFrame:
@@ -241,23 +323,32 @@ def main() -> None:
     parser.add_argument("--presets", nargs="+", default=["open_sky", "mixed"])
     parser.add_argument("--counts", nargs="+", type=int, default=list(COUNTS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1])
+    parser.add_argument("--builds", action="store_true", help="whole builds from traces instead of plan graphs")
     parser.add_argument("--out", type=Path, help="CSV file of all counts")
     args = parser.parse_args()
+    score = score_builds if args.builds else score_plan
     parts = []
     for preset in args.presets:
         for name in args.kinds:
             for seed in args.seeds:
-                parts.append(score_plan(name, preset, args.counts, seed=seed))
-                print(with_scores(parts[-1], ["kind", "preset", "drives", "variant"])["f1"].unstack("variant").round(3))
+                parts.append(score(name, preset, args.counts, seed=seed))
+                print(f"{name}, {preset}, seed {seed}: done", flush=True)
     counted = pd.concat(parts, ignore_index=True)
     if args.out:
         counted.to_csv(args.out, index=False)
-    order = [*VARIANTS]
-    print("\nF1 by drives per movement")
-    print(with_scores(counted, ["preset", "drives", "variant"])["f1"].unstack("variant")[order].round(3))
-    print("\nprecision / recall by drives per movement")
-    scores = with_scores(counted, ["drives", "variant"])
-    print(scores[["precision", "recall"]].unstack("variant").round(3).to_string())
+    for by in (["preset", "drives"], ["kind", "drives"]):
+        print("\nF1 by", " and ".join(by))
+        print(_table(counted, by, "f1"))
+    for what in ("precision", "recall"):
+        print(f"\n{what} by drives")
+        print(_table(counted, ["drives"], what))
+
+
+def _table(counted: pd.DataFrame, by: list[str], what: str) -> str:
+    """Write one score with a column for each variant."""
+    scores = with_scores(counted, [*by, "variant"]).reset_index()
+    wide = scores.pivot_table(index=by, columns="variant", values=what, sort=False, dropna=False)
+    return wide.round(3).to_string()
 
 
 if __name__ == "__main__":

@@ -91,7 +91,8 @@ def fill_gaps(graph: RoadGraph, *, options: GapOptions | None = None) -> RoadGra
 
     From every dead end, links may lead to
 
-    1. the nearest dead end for which the turn is not sharper than ``max_turn`` at either end;
+    1. the nearest dead end for which the turn is not sharper than ``max_turn`` at either end; turns count like detours,
+       so that the ends of two interrupted roads that cross are joined across;
     2. what its straight extension hits first: a node where one is within ``snap`` of the hit, else the edge, which is
        split there;
     3. the nearest edge within ``beside`` that runs along it, as a mainline beside the end of its ramp, joined a
@@ -240,14 +241,19 @@ def _dead_ends(graph: RoadGraph, lines: NDArray[np.object_], reach: float) -> _D
 
 
 def _to_dead_ends(ends: _DeadEnds, options: GapOptions) -> _Links:
-    """Link every dead end to the nearest one that lies ahead of it and that it lies ahead of."""
+    """Link every dead end to the nearest one that lies ahead of it and that it lies ahead of.
+
+    A turn counts like a detour, a right angle like the distance once more: where two interrupted roads cross, their
+    four ends are joined across and not around the corner.
+    """
     pairs = KDTree(ends.position).query_pairs(options.max_length, output_type="ndarray") if len(ends.edge) else []
     one, other = np.concatenate([pairs, np.flip(pairs, 1)]).T if len(pairs) else np.zeros((2, 0), np.int64)
     vector = ends.position[other] - ends.position[one]
-    turns = np.maximum(_angle(ends.ahead[one], vector), _angle(-ends.ahead[other], vector))
-    fits = (turns <= options.max_turn) & (np.hypot(*vector.T) > 0)
-    one, other, vector = one[fits], other[fits], vector[fits]
-    order = np.lexsort([*ends.position[other].T, np.hypot(*vector.T), one])
+    turns = np.stack([_angle(ends.ahead[one], vector), _angle(-ends.ahead[other], vector)])
+    distance = np.hypot(*vector.T) * (1.0 + turns.sum(axis=0) / 90.0)
+    fits = (turns.max(axis=0) <= options.max_turn) & (distance > 0)
+    one, other, distance = one[fits], other[fits], distance[fits]
+    order = np.lexsort([*ends.position[other].T, distance.round(6), one])
     nearest = order[_heads(one[order])]
     one, other = one[nearest], other[nearest]
     unknown = np.full(len(one), -1)
