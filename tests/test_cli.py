@@ -125,3 +125,66 @@ def test_bad_input_is_one_clear_error_and_no_output(folder, call, arguments, mes
     assert message in err
     assert "Traceback" not in err
     assert not [*folder.glob("x.*"), *folder.glob(".x*")]
+
+
+ROADS = """<osm version="0.6">
+<node id="1" lat="52.0" lon="9.0"/><node id="2" lat="52.0" lon="9.03"/><node id="3" lat="52.002" lon="9.05"/>
+<way id="9"><nd ref="1"/><nd ref="2"/><nd ref="3"/><tag k="highway" v="motorway"/></way></osm>"""
+
+
+def test_simulate_writes_fleet_data_that_build_reads_and_the_truth(folder, call):
+    (folder / "roads.osm").write_text(ROADS)
+    code, _, err = call("simulate", "roads.osm", "--drives", 4, "--seed", 1, "--aligned", "-o", "fleet")
+    assert code == 0, err
+    assert {path.name for path in (folder / "fleet").iterdir()} == {
+        *("drives.parquet", "drives.points.parquet", "aligned.parquet", "aligned.points.parquet", "poses.parquet"),
+        *("routes.parquet", "reference.gpkg", "run.json"),
+    }
+    assert read_graph(folder / "fleet" / "reference.gpkg").edges["support"].tolist() == [4]
+    code, _, err = call("build", "fleet/drives.parquet", "--points", "fleet/drives.points.parquet", "-o", "made.gpkg")
+    assert code == 0, err
+    assert read_graph(folder / "made.gpkg").length == pytest.approx(3450, abs=150)
+
+
+def test_simulate_follows_the_seed(folder, call):
+    (folder / "roads.osm").write_text(ROADS)
+    for name, seed in (("first", 1), ("again", 1), ("other", 2)):
+        assert call("simulate", "roads.osm", "--kilometres", 5, "--seed", seed, "-q", "-o", name)[0] == 0
+    first, again, other = ((folder / name / "drives.parquet").read_bytes() for name in ("first", "again", "other"))
+    assert first == again
+    assert first != other
+
+
+def test_benchmark_prepare_makes_a_data_set_of_generated_roads(folder, call, monkeypatch):
+    from dataclasses import replace
+
+    from probe2road.benchmark import datasets
+
+    tiny = replace(datasets.find_dataset("corridor-1"), drive_km=8.0)
+    monkeypatch.setattr(datasets, "DATASETS", {"corridor-1": tiny})
+    code, out, err = call("benchmark", "prepare", "corridor-1", "-o", "sets")
+    assert code == 0, err
+    assert out.split() == ["sets/corridor-1"]
+    assert (folder / "sets" / "corridor-1" / "manifest.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["simulate", "roads.osm", "-o", "x"], "pass --drives or --kilometres"),
+        (["simulate", "roads.osm", "--drives", 1, "--kilometres", 1, "-o", "x"], "pass --drives or --kilometres"),
+        (["simulate", "roads.osm", "--drives", 0, "-o", "x"], "give one, above 0"),
+        (["simulate", "roads.osm", "--drives", 1, "--preset", "sunny", "-o", "x"], "preset 'sunny' is unknown"),
+        (["simulate", "roads.osm", "--drives", 1, "--preset", "phone", "--aligned", "-o", "x"], "no camera"),
+        (["simulate", "absent.osm", "--drives", 1, "-o", "x"], "no such file"),
+        (["simulate", "roads.osm", "--drives", 1, "-o", "."], "not empty and not a recording"),
+        (["benchmark", "prepare", "atlantis", "-o", "x"], "there is no data set 'atlantis'"),
+        (["benchmark", "prepare", "boston", "--data", "absent", "-o", "x"], "there is no such extract"),
+    ],
+)
+def test_bad_simulations_are_one_clear_error(folder, call, arguments, message):
+    (folder / "roads.osm").write_text(ROADS)
+    code, _, err = call(*arguments)
+    assert code == 2
+    assert err.count("error: ") == 1
+    assert message in err

@@ -36,6 +36,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+_benchmark = typer.Typer(name="benchmark", help="The open benchmark.", no_args_is_help=True)
+app.add_typer(_benchmark)
+
 # Options that several verbs share.
 Columns = Annotated[
     str | None, typer.Option(help="Columns of the traces, ours=theirs: trace_id=trip,t=time,x=lon,y=lat,z=alt.")
@@ -209,6 +212,63 @@ def demo(
     typer.echo("\nOpen these:")
     for path, what in files.items():
         typer.echo(f"  {path}  {what}")
+
+
+@app.command()
+def simulate(
+    network: Annotated[Path, typer.Argument(help="Road network: .osm or .osm.pbf.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write to.")],
+    preset: Annotated[str, typer.Option(help="open_sky, mixed, urban_canyon, phone, or a TOML file.")] = "mixed",
+    seed: Annotated[int, typer.Option(help="The same seed makes the same fleet.")] = 0,
+    drives: Annotated[int | None, typer.Option(help="How many drives.")] = None,
+    kilometres: Annotated[float | None, typer.Option(help="How many kilometres in all, instead of drives.")] = None,
+    aligned: Annotated[bool, typer.Option("--aligned", help="Also write what an alignment would leave.")] = False,
+    workers: Annotated[int, typer.Option(help="Processes; no influence on the result.")] = 1,
+) -> None:
+    """Simulate a vehicle fleet on a road network: raw fleet data, true poses, and the true road graph.
+
+    An interrupted run goes on where it stopped when it is started again.
+    """
+    from probe2road.benchmark.recording import record_fleet
+    from probe2road.benchmark.residual import ResidualModel
+    from probe2road.simulate.osm import read_network
+    from probe2road.simulate.presets import find_preset
+
+    if (drives is None) == (kilometres is None):
+        raise OptionError("the amount must be given once", where="simulate", fix="pass --drives or --kilometres")
+    chosen = find_preset(preset)
+    with _progress_bar() as progress:
+        record_fleet(
+            read_network(network),
+            output,
+            preset=chosen,
+            n_drives=drives,
+            drive_km=kilometres,
+            seed=seed,
+            workers=workers,
+            residual=ResidualModel() if aligned else None,
+            progress=progress,
+        )
+
+
+@_benchmark.command()
+def prepare(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder that gets a folder for each data set.")],
+    names: Annotated[
+        list[str] | None, typer.Argument(help="Data sets, NAME-PRESET, or groups; all cities without any.")
+    ] = None,
+    data: Annotated[Path, typer.Option(help="Folder of the OpenStreetMap extracts.")] = Path("../shared/data/osm"),
+    workers: Annotated[int, typer.Option(help="Processes; no influence on the result.")] = 1,
+) -> None:
+    """Make data sets of the open benchmark: simulated fleets on real roads, with the truth and fixed splits.
+
+    An interrupted run goes on where it stopped when it is started again.
+    """
+    from probe2road.benchmark.prepare import prepare as prepare_datasets
+
+    with _progress_bar() as progress:
+        for folder in prepare_datasets(names or [], output, data=data, workers=workers, progress=progress):
+            typer.echo(folder)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,0 +1,369 @@
+"""A simulated fleet on disk, written as it is driven: bounded memory, and a killed run goes on where it stopped.
+
+Strategy: the drives come in portions, and each portion becomes one folder of small Parquet files, which is complete
+or absent. When all portions are there they are joined, file by file, into the tables of the recording. A drive
+depends on the seed and its number alone, so the result is the same whether a run was interrupted or not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import shapely
+
+from probe2road.benchmark.residual import ResidualModel, align_drives
+from probe2road.errors import OptionError, OutputError
+from probe2road.export import write_graph
+from probe2road.io.atomic import atomic_path
+from probe2road.recipe import Progress
+from probe2road.roadgraph import RoadGraph
+from probe2road.simulate.fleet_simulation import FleetChunk, simulate_chunks
+from probe2road.simulate.network import RoadNetwork
+from probe2road.simulate.presets import Preset, find_preset
+from probe2road.simulate.records import count_drives
+
+__all__ = ["RUN_FILE", "Recording", "record_fleet"]
+
+logger = logging.getLogger(__name__)
+
+RUN_FILE = "run.json"
+
+_FORMAT = 1  # raised when what a recording holds changes
+_PORTIONS = ".portions"
+_DRIVES = 20  # drives in a portion: some 300 km, 600,000 points
+_ROW_GROUP = 262_144  # rows, as in `probe2road.io.fleet_writer`
+# Table of a portion to the file that the tables of all portions become.
+_FILES = {
+    "traces": "drives.parquet",
+    "points": "drives.points.parquet",
+    "aligned_traces": "aligned.parquet",
+    "aligned_points": "aligned.points.parquet",
+    "poses": "poses.parquet",
+    "routes": "routes.parquet",
+}
+_REFERENCE = "reference.gpkg"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What `record_fleet` wrote: files that a simulated fleet may have, in one folder."""
+
+    folder: Path
+
+    @property
+    def drives(self) -> Path:
+        """Raw traces; the points lie beside them, where there is a camera."""
+        return self.folder / _FILES["traces"]
+
+    @property
+    def aligned(self) -> Path:
+        """Aligned traces; absent where no alignment was asked for."""
+        return self.folder / _FILES["aligned_traces"]
+
+    @property
+    def poses(self) -> Path:
+        """True poses, row by row those of the traces."""
+        return self.folder / _FILES["poses"]
+
+    @property
+    def routes(self) -> Path:
+        """Sections driven."""
+        return self.folder / _FILES["routes"]
+
+    @property
+    def reference(self) -> Path:
+        """The true road graph with the true numbers of drives."""
+        return self.folder / _REFERENCE
+
+    @property
+    def run(self) -> dict[str, Any]:
+        """How it was made: preset, seed, amount, versions, counts."""
+        return dict(json.loads((self.folder / RUN_FILE).read_text(encoding="utf-8")))
+
+    @property
+    def files(self) -> list[Path]:
+        """All files of the recording that there are, ordered by name."""
+        names = [*_FILES.values(), _REFERENCE, RUN_FILE]
+        return sorted(self.folder / name for name in names if (self.folder / name).exists())
+
+
+def record_fleet(
+    network: RoadNetwork,
+    folder: str | Path,
+    *,
+    preset: str | Path | Preset = "mixed",
+    n_drives: int | None = None,
+    drive_km: float | None = None,
+    seed: int = 0,
+    workers: int = 1,
+    residual: ResidualModel | None = None,
+    progress: Progress | None = None,
+) -> Recording:
+    """Simulate a fleet and write what it recorded, and the truth, to a folder.
+
+    Parameters
+    ----------
+    network
+        The roads.
+    folder
+        Created where it does not exist. A recording of another run in it is replaced; one of the same run is taken
+        as it is, or completed.
+    preset, n_drives, drive_km, seed, workers
+        As in `probe2road.simulate.fleet_simulation.simulate`. The workers have no influence on the result.
+    residual
+        Also write the fleet data that an alignment with these residual errors would leave. A fleet without camera
+        cannot be aligned.
+    progress
+        Called with the drives or kilometres done and wanted.
+
+    Returns
+    -------
+    Recording
+        ``drives.parquet`` and ``drives.points.parquet`` (raw fleet data, which `probe2road.read_fleet` reads),
+        ``aligned.parquet`` and ``aligned.points.parquet``, ``poses.parquet``, ``routes.parquet``,
+        ``reference.gpkg``, ``run.json``. The last is written last.
+
+    Raises
+    ------
+    OptionError
+        If the amount is missing, given twice or not positive, the preset is unknown, or a fleet without camera is
+        to be aligned.
+    OutputError
+        If the folder has files in it that are not those of a recording, or cannot be created.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from probe2road.simulate.network import network_from_sections
+    >>> network = network_from_sections([[(0, 0), (2000, 0)]], crs="EPSG:32616")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     recording = record_fleet(network, folder, n_drives=3, seed=7)
+    ...     [path.name for path in recording.files], recording.run["counts"]["drives"]
+    (['drives.parquet', 'drives.points.parquet', 'poses.parquet', 'reference.gpkg', 'routes.parquet', 'run.json'], 3)
+    """
+    chosen = find_preset(preset)
+    if (n_drives is None) == (drive_km is None) or not (n_drives or drive_km or 0) > 0:
+        raise OptionError(
+            f"n_drives is {n_drives}, drive_km is {drive_km}", where="record_fleet", fix="give one, above 0"
+        )
+    if residual is not None and chosen.camera is None:
+        raise OptionError(f"preset {chosen.name!r} has no camera to align by", where="record_fleet", fix="use another")
+    run = {
+        "format": _FORMAT,
+        "network": _fingerprint(network),
+        "preset": asdict(chosen),
+        "n_drives": n_drives,
+        "drive_km": drive_km,
+        "seed": seed,
+        "residual": None if residual is None else asdict(residual),
+        "versions": {name: version(name) for name in ("probe2road", "numpy")},
+    }
+    recording = Recording(Path(folder))
+    portions = _open(recording.folder, json.loads(json.dumps(run)))
+    if portions is None:
+        logger.info("taking %s from an earlier run", recording.folder)
+        return recording
+    amount = {"n_drives": n_drives, "drive_km": drive_km}
+    _simulate_portions(network, chosen, portions, amount, seed, workers, residual, progress)
+    counts = _join(network, portions, recording, run)
+    logger.info(
+        "recorded %d drives, %.0f km: %d poses, %d points in %s",
+        counts["drives"], counts["km"], counts["traces"], counts["points"], recording.folder,
+    )  # fmt: skip
+    return recording
+
+
+def _open(folder: Path, run: Mapping[str, Any]) -> Path | None:
+    """Prepare the folder: where the portions go, or None if this very recording is there already."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot be created ({error.strerror})", where=folder) from error
+    done, portions = folder / RUN_FILE, folder / _PORTIONS
+    mark = portions / RUN_FILE
+    if done.exists():
+        if _same_run(done, run):
+            shutil.rmtree(portions, ignore_errors=True)
+            return None
+        done.unlink()  # what lies beside it is no longer complete
+    elif not mark.exists() and any(folder.iterdir()):
+        raise OutputError("the folder is not empty and not a recording", where=folder, fix="name an empty folder")
+    if not (mark.exists() and _same_run(mark, run)):
+        shutil.rmtree(portions, ignore_errors=True)
+        portions.mkdir()
+        with atomic_path(mark) as temporary:
+            temporary.write_text(json.dumps(run, indent=1), encoding="utf-8")
+    return portions
+
+
+def _same_run(path: Path, run: Mapping[str, Any]) -> bool:
+    kept = json.loads(path.read_text(encoding="utf-8"))
+    return all(kept.get(name) == value for name, value in run.items())
+
+
+def _simulate_portions(
+    network: RoadNetwork,
+    preset: Preset,
+    portions: Path,
+    amount: Mapping[str, float | None],
+    seed: int,
+    workers: int,
+    residual: ResidualModel | None,
+    progress: Progress | None,
+) -> None:
+    """Drive what is missing and write it, portion by portion."""
+    number, km = 0, 0.0
+    for path in _complete(portions):
+        number, km = number + _about(path)["drives"], km + _about(path)["km"]
+    wanted, done = (amount["n_drives"], number) if amount["n_drives"] is not None else (amount["drive_km"], km)
+    if number:
+        logger.info("going on behind drive %d (%.0f km)", number - 1, km)
+    if wanted is not None and number and done >= wanted:
+        return
+    left = {name: None if value is None else value - done for name, value in amount.items()}
+    chunks = simulate_chunks(
+        network, preset=preset, seed=seed, workers=workers, first_drive=number, chunk_drives=_DRIVES,
+        n_drives=None if left["n_drives"] is None else int(left["n_drives"]), drive_km=left["drive_km"],
+    )  # fmt: skip
+    for part, chunk in enumerate(chunks, start=len(_complete(portions))):
+        _write_portion(chunk, portions / f"{part:06d}", residual, seed)
+        number, km = number + len(chunk.length), km + float(chunk.length.sum()) / 1000.0
+        if progress is not None and wanted is not None:
+            progress("drives" if amount["n_drives"] is not None else "km", _done(amount, number, km), int(wanted))
+
+
+def _done(amount: Mapping[str, float | None], number: int, km: float) -> int:
+    """How much of the amount is reached."""
+    return number if amount["n_drives"] is not None else min(int(km), int(amount["drive_km"] or 0))
+
+
+def _complete(portions: Path) -> list[Path]:
+    """Folders of the portions that are there; they are written in order, so none is missing between them."""
+    return sorted(path for path in portions.iterdir() if path.is_dir() and not path.name.startswith("."))
+
+
+def _about(portion: Path) -> dict[str, Any]:
+    return dict(json.loads((portion / "about.json").read_text(encoding="utf-8")))
+
+
+def _write_portion(chunk: FleetChunk, path: Path, residual: ResidualModel | None, seed: int) -> None:
+    """Write one portion as a folder that is complete or absent."""
+    tables = {name: getattr(chunk, name) for name in ("traces", "points", "poses", "routes")}
+    if residual is not None:
+        aligned = align_drives(chunk.traces, chunk.points, chunk.poses, residual, seed=seed)
+        tables |= {"aligned_traces": aligned[0], "aligned_points": aligned[1]}
+    boxes = {}
+    with atomic_path(path) as temporary:
+        temporary.mkdir()
+        for name, table in tables.items():
+            pq.write_table(_arrow(table), temporary / f"{name}.parquet", compression="zstd")
+            boxes[name] = _box(table)
+        about = {"drives": len(chunk.length), "km": float(chunk.length.sum()) / 1000.0, "boxes": boxes}
+        (temporary / "about.json").write_text(json.dumps(about), encoding="utf-8")
+
+
+def _arrow(table: pd.DataFrame) -> pa.Table:
+    """Turn a table into Arrow; positions become one column of native points, as GeoParquet has them."""
+    if "x" not in table:
+        return pa.Table.from_pandas(table, preserve_index=False)
+    axes = [pa.array(table[axis].to_numpy(np.float64), pa.float64(), from_pandas=False) for axis in "xyz"]
+    points = pa.StructArray.from_arrays(axes, fields=[pa.field(axis, pa.float64(), False) for axis in "xyz"])
+    columns = pa.Table.from_pandas(table.drop(columns=list("xyz")), preserve_index=False)
+    return columns.append_column(pa.field("geometry", points.type, False), points)
+
+
+def _box(table: pd.DataFrame) -> list[float] | None:
+    """Bounding box ``[left, bottom, right, top]``, None where there is no position."""
+    if "x" not in table or table.empty:
+        return None
+    return [float(value) for value in (*table[["x", "y"]].min(), *table[["x", "y"]].max())]
+
+
+def _join(network: RoadNetwork, portions: Path, recording: Recording, run: Mapping[str, Any]) -> dict[str, float]:
+    """Join the portions to the files of the recording; the last file says that all are there."""
+    for stray in recording.folder.glob(".*.*"):  # where an earlier run was killed as it wrote a file
+        shutil.rmtree(stray, ignore_errors=True)
+    parts = _complete(portions)
+    abouts = [_about(part) for part in parts]
+    counts: dict[str, float] = {"drives": sum(about["drives"] for about in abouts)}
+    counts["km"] = round(sum(about["km"] for about in abouts), 3)
+    crs = network.crs.to_json_dict()
+    for name, file in _FILES.items():
+        boxes = [box for about in abouts if (box := about["boxes"].get(name)) is not None]
+        target = recording.folder / file
+        target.unlink(missing_ok=True)
+        if boxes or name == "routes":
+            counts[name] = _join_table(parts, name, target, crs, boxes)
+    write_graph(_counted(network, parts), recording.reference)
+    counts.setdefault("points", 0)
+    with atomic_path(recording.folder / RUN_FILE) as temporary:
+        temporary.write_text(json.dumps({**run, "counts": counts}, indent=1), encoding="utf-8")
+    shutil.rmtree(portions)
+    return counts
+
+
+def _join_table(parts: list[Path], name: str, target: Path, crs: Mapping[str, Any], boxes: list[list[float]]) -> int:
+    """Copy a table of all portions into one file, a row group or more for each portion; returns the rows."""
+    schema = pq.read_schema(parts[0] / f"{name}.parquet")
+    if boxes:
+        lows, highs = np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]
+        about = {"encoding": "point", "geometry_types": ["Point Z"], "crs": crs, "bbox": [*lows, *highs]}
+        geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": about}}
+        schema = schema.with_metadata({**(schema.metadata or {}), b"geo": json.dumps(geo).encode()})
+    # Times and ids rise in small steps: their differences take a third of the space.
+    rising = {column: "DELTA_BINARY_PACKED" for column in ("trace_id", "t") if column in schema.names}
+    repeated = [column for column in ("kind", "section", "lane") if column in schema.names]
+    rows = 0
+    with (
+        atomic_path(target) as temporary,
+        pq.ParquetWriter(
+            temporary, schema, compression="zstd", use_dictionary=repeated, column_encoding=rising
+        ) as writer,
+    ):
+        for part in parts:
+            table = pq.read_table(part / f"{name}.parquet", partitioning=None)
+            writer.write_table(table.replace_schema_metadata(schema.metadata), row_group_size=_ROW_GROUP)
+            rows += table.num_rows
+    return rows
+
+
+def _counted(network: RoadNetwork, parts: list[Path]) -> RoadGraph:
+    """Return the true road graph with the drives of all portions; no drive is in two of them."""
+    reference = network.reference_graph()
+    columns = ["support", "forward", "backward"]
+    total = pd.DataFrame(0, index=reference.edges.index, columns=columns, dtype="Int64")
+    turns = [reference.turns]
+    for routes in _routes(parts):
+        counted = count_drives(reference, routes)
+        total += counted.edges[columns]
+        turns.append(counted.turns)
+    keys = ["from_edge", "via_node", "to_edge"]
+    joined = pd.concat(turns, ignore_index=True).groupby(keys, as_index=False)["count"].sum().astype("int64")
+    return replace(reference, edges=reference.edges.assign(**total), turns=joined)
+
+
+def _routes(parts: list[Path]) -> Iterator[pd.DataFrame]:
+    """Routes of each portion."""
+    return (pq.read_table(part / "routes.parquet", partitioning=None).to_pandas() for part in parts)
+
+
+def _fingerprint(network: RoadNetwork) -> str:
+    """Digest of everything in a network that drives depend on."""
+    digest = hashlib.blake2b(f"{network.crs.to_wkt()}{network.driving_side}{network.markings}".encode(), digest_size=16)
+    for table in (network.sections.drop(columns="geometry"), network.restrictions):
+        digest.update(table.to_csv().encode())
+    for line in shapely.to_wkb(network.sections.geometry.to_numpy()):
+        digest.update(line)
+    return digest.hexdigest()
