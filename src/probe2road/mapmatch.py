@@ -123,7 +123,7 @@ def match(
     >>> found.fixes["edge"].tolist()
     [0, 0, 0, 1, <NA>]
     >>> found.fixes["reason"].iloc[-1]
-    'no edge within 50 m'
+    'no edge within 60 m'
     >>> found.steps[["edge", "forward", "entered", "left", "via_node"]].values.tolist()
     [[0, True, False, True, <NA>], [1, True, True, False, 1]]
     """

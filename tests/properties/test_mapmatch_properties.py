@@ -130,5 +130,5 @@ def test_steps_and_fixes_agree_whatever_the_noise(seed: int, noise: float, profi
     onto = np.flatnonzero(steps["entered"])
     assert (ends[onto, 0] == ends[onto - 1, 1]).all()
     assert (ends[onto, 0] == steps["via_node"].to_numpy()[onto]).all()
-    assert steps["left"].tolist() == [*steps["entered"].tolist()[1:], False]
+    assert steps["left"].tolist() == [*steps["entered"].tolist(), False][1:]
     assert (steps["part"].diff().iloc[1:].to_numpy() == ~steps["entered"].to_numpy()[1:]).all()

@@ -17,16 +17,16 @@ class RouteModel:
     The defaults are those of the profile `FLEET`; `SPARSE` differs in the fields that depend on the interval.
     """
 
-    sigma: float = 4.5  # m, spread of fixes about the centreline; the column accuracy can only widen it
+    sigma: float = 5.0  # m, spread of fixes about the centreline; the column accuracy can only widen it
     tail: float = 4.0  # degrees of freedom of Student's t, the law of the distances; small is tolerant of outliers
-    radius: float = 50.0  # m, of the search for candidates
+    radius: float = 60.0  # m, of the search for candidates
     null_distance: float = 35.0  # m, to a road in the right direction, beyond which no road is the better explanation
-    spacing: float = 10.0  # m; fixes nearer than this to the one before only follow the route, they do not shape it
-    beta: float = 5.0  # m, mean excess of the route over the straight line between two fixes
+    spacing: float = 25.0  # m; fixes nearer than this to the one before only follow the route, they do not shape it
+    beta: float = 10.0  # m, mean excess of the route over the straight line between two fixes
     beta_rate: float = 0.0  # m/s, by which that mean grows with the time between them
-    break_cost: float = 12.0  # of a jump that no route explains; leaving the network and returning cost half each
-    uturn_cost: float = 8.0  # of turning back at a node; half of it at a dead end
-    turn_cost: float = 0.0  # of a turn by 180 degrees, growing with 1 - cos of the angle
+    break_cost: float = 20.0  # of a jump that no route explains; leaving the network and returning cost half each
+    uturn_cost: float = 10.0  # of turning back at a node; half of it at a dead end
+    turn_cost: float = 1.5  # of a turn by 180 degrees, growing with 1 - cos of the angle
     heading_weight: float = 4.0  # kappa of von Mises' law for the column heading
     course_weight: float = 2.0  # the same for the direction from the fix before to the fix after
     course_interval: float = 5.0  # s between fixes, beyond which that direction says little
@@ -80,11 +80,15 @@ def _require(model: Any, name: str, *, above: bool = False) -> None:
 
 FLEET = RouteModel()
 SPARSE = RouteModel(
+    sigma=7.0,
+    tail=8.0,
     radius=80.0,
     null_distance=60.0,
     spacing=10.0,
     beta=10.0,
-    beta_rate=1.0,
+    beta_rate=1.5,
     break_cost=15.0,
+    uturn_cost=6.0,
+    turn_cost=2.0,
     course_weight=0.0,
 )

@@ -1,0 +1,354 @@
+from __future__ import annotations
+
+import os
+from itertools import pairwise
+from pathlib import Path
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import pytest
+import shapely
+from numpy.typing import NDArray
+
+from probe2road.errors import CRSError, InputError, OptionError
+from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.mapmatch import Matches, MatchOptions, match, turn_counts
+from probe2road.matching.models import PublishedModel, RouteModel
+from probe2road.matching.network import build_states
+from probe2road.matching.published import emission_table, transition
+from probe2road.options import options_from_table
+from probe2road.roadgraph import RoadGraph, empty_graph, empty_turns, finish_edges, graph_from_lines
+
+CRS = "EPSG:32616"
+
+
+def fleet(xy: NDArray[np.float64] | list[tuple[float, float]], *, interval: float = 1.0, **columns: object) -> Fleet:
+    places = np.asarray(xy, float)
+    table = pd.DataFrame(
+        {"trace_id": "a", "t": interval * np.arange(len(places)), "x": places[:, 0], "y": places[:, 1]}
+    )
+    return fleet_from_tables(table.assign(**columns), crs=CRS, target_crs=CRS)
+
+
+def along(*corners: tuple[float, float], spacing: float = 10.0) -> NDArray[np.float64]:
+    line = shapely.LineString(corners)
+    return shapely.get_coordinates(shapely.line_interpolate_point(line, np.arange(0.0, line.length + 0.1, spacing)))
+
+
+def driven(found: Matches) -> list[tuple[int, bool]]:
+    return list(zip(found.steps["edge"].tolist(), found.steps["forward"].tolist(), strict=True))
+
+
+CROSSING = [[(-200, 0), (0, 0)], [(0, 0), (200, 0)], [(0, -200), (0, 0)], [(0, 0), (0, 200)]]
+
+
+@pytest.mark.parametrize("profile", ["fleet", "sparse", "published"])
+@pytest.mark.parametrize(
+    ("corners", "edges"),
+    [
+        ([(-190, 0), (190, 0)], [(0, True), (1, True)]),
+        ([(190, 0), (-190, 0)], [(1, False), (0, False)]),
+        ([(-190, 0), (0, 0), (0, 190)], [(0, True), (3, True)]),
+        ([(0, -190), (0, 0), (-190, 0)], [(2, True), (0, False)]),
+    ],
+)
+def test_every_turn_of_a_crossing(
+    profile: str, corners: list[tuple[float, float]], edges: list[tuple[int, bool]]
+) -> None:
+    graph = graph_from_lines(CROSSING, crs=CRS)
+    found = match(fleet(along(*corners) + 2.0), graph, MatchOptions(profile=profile))
+    assert driven(found) == edges
+    turns = turn_counts(found, graph)
+    centre = int(graph.edges["v"].iloc[0])
+    assert turns.to_numpy().tolist() == [[edges[0][0], centre, edges[1][0], 1]]
+    assert found.fixes["edge"].notna().all()
+
+
+def test_steps_say_where_a_traversal_begins_and_ends() -> None:
+    graph = graph_from_lines(CROSSING, crs=CRS)
+    found = match(fleet(along((-190, 0), (190, 0))), graph)
+    assert found.steps[["entered", "left"]].to_numpy().tolist() == [[False, True], [True, False]]
+    assert found.steps["via_node"].isna().tolist() == [True, False]
+    assert found.steps["t_first"].iloc[0] == found.fixes["t"].iloc[0]
+    assert found.steps["t_last"].iloc[1] == found.fixes["t"].iloc[-1]
+    assert list(found.fixes) == ["trace_id", "t", "edge", "offset", "distance", "forward", "reason"]
+    assert [str(found.fixes[column].dtype) for column in ("edge", "forward", "reason")] == [
+        "Int64",
+        "boolean",
+        "category",
+    ]
+
+
+def test_offsets_run_from_u_whichever_way_the_edge_is_driven() -> None:
+    graph = graph_from_lines([[(0, 0), (100, 0)]], crs=CRS)
+    for xy in ([(20, 1), (50, 1), (80, 1)], [(80, 1), (50, 1), (20, 1)]):
+        found = match(fleet(xy), graph)
+        assert found.fixes["offset"].tolist() == [x for x, _ in xy]
+        assert found.fixes["distance"].tolist() == [1.0, 1.0, 1.0]
+        assert found.fixes["forward"].eq(xy[0][0] == 20).all()
+
+
+@pytest.mark.parametrize("side", [0.0, 12.0])
+def test_parallel_carriageways_are_told_apart(side: float) -> None:
+    graph = graph_from_lines([[(0, 0), (800, 0)], [(800, 12), (0, 12)]], crs=CRS)
+    rng = np.random.default_rng(0)
+    xy = along((10, side), (790, side), spacing=15.0)
+    found = match(fleet(xy + rng.normal(0, 2.0, xy.shape)), graph)
+    assert found.fixes["edge"].eq(0 if side == 0 else 1).all()
+
+
+def test_oneway_closes_the_other_way() -> None:
+    lines = [[(0, 0), (400, 0)], [(0, 6), (400, 6)]]
+    graph = graph_from_lines(lines, crs=CRS, attributes=pd.DataFrame({"oneway": ["-1", "yes"]}))
+    xy = along((10, 2), (390, 2))
+    assert driven(match(fleet(xy), graph)) == [(1, True)]
+    assert driven(match(fleet(xy), graph, MatchOptions(respect_oneway=False))) == [(0, True)]
+
+
+def test_the_heading_column_tells_a_standing_vehicle_from_the_cross_street() -> None:
+    graph = graph_from_lines(CROSSING, crs=CRS)
+    for heading, edge in ((90.0, {0}), (0.0, {2})):
+        found = match(fleet([(-2.0, -2.0)] * 3, heading=heading), graph)
+        assert set(found.fixes["edge"]) == edge
+        assert found.fixes["forward"].all()
+
+
+def stacked_roads() -> RoadGraph:
+    """Two roads 1 km long, 4 m apart in plan and 7 m in height, which start level and 60 m apart."""
+    x = np.array([0.0, 200, 400, 600, 1000])
+    lower = np.stack([x, [30, 30, 0, 0, 0], [0, 0, 0, 0, 0]], axis=1)
+    upper = np.stack([x, [-30, -30, -4, -4, -4], [0, 0, 7, 7, 7]], axis=1)
+    return graph_from_lines([lower, upper], crs=CRS)
+
+
+@pytest.mark.parametrize("drift", [-9.0, 0.0, 9.0])
+@pytest.mark.parametrize("height", [0.0, 7.0])
+def test_altitude_tells_stacked_roads_apart_whatever_the_bias(height: float, drift: float) -> None:
+    graph = stacked_roads()
+    rng = np.random.default_rng(1)
+    x = np.arange(410.0, 990.0, 15.0)
+    xy = np.stack([x, np.full(len(x), -2.0)], axis=1) + rng.normal(0, 2.0, (len(x), 2))
+    before = np.stack([np.arange(0.0, 190.0, 15.0), np.full(13, 30.0 if height == 0 else -30.0)], axis=1)
+    # The roads are level and agree about the altitude before they meet: the bias is learnt there.
+    places = np.concatenate([before, xy])
+    z = np.concatenate([np.zeros(len(before)), np.full(len(x), height)]) + drift + rng.normal(0, 0.7, len(places))
+    found = match(fleet(places, z=z), graph)
+    assert found.fixes["edge"].eq(0 if height == 0 else 1).mean() > 0.95
+
+
+def test_short_edges_between_fixes_are_on_the_path() -> None:
+    x = [0.0, 50.0, 53.0, 54.0, 56.0, 60.0, 160.0]
+    graph = graph_from_lines([[(a, 0), (b, 0)] for a, b in pairwise(x)], crs=CRS)
+    found = match(fleet(along((5, 1), (155, 1), spacing=25.0)), graph)
+    assert [edge for edge, _ in driven(found)] == [0, 1, 2, 3, 4, 5]
+    assert found.steps["t_first"].isna().tolist() == [False, True, True, False, True, False]
+    assert turn_counts(found, graph)["count"].tolist() == [1] * 5
+
+
+def test_loops_and_parallel_edges_are_distinguished() -> None:
+    ring = [(100, 0), (150, 50), (200, 0), (150, -50), (100, 0)]
+    lines = [[(0, 0), (100, 0)], ring, [(0, 0), (50, 40), (100, 0)]]
+    graph = graph_from_lines(lines, crs=CRS)
+    found = match(fleet(along((5, 4), (50, 40), (100, 0), (150, 50), (200, 0), (150, -50), (100, 0), (10, 0))), graph)
+    assert driven(found) == [(2, True), (1, True), (0, False)]
+    node = int(graph.edges["v"].iloc[0])
+    assert turn_counts(found, graph).to_numpy().tolist() == [[1, node, 0, 1], [2, node, 1, 1]]
+
+
+def test_weights_decide_between_equal_ways() -> None:
+    lines = [[(-100, 0), (0, 0)], [(0, 0), (50, 3), (100, 0)], [(0, 0), (50, -3), (100, 0)], [(100, 0), (200, 0)]]
+    graph = graph_from_lines(lines, crs=CRS)
+    trace = fleet(along((-90, 0), (190, 0)))
+    for dear in (1, 2):
+        weights = pd.Series(1.0, index=graph.edges.index)
+        weights[dear] = 0.1
+        assert driven(match(trace, graph, edge_weights=weights))[1] == (3 - dear, True)
+    with pytest.raises(InputError, match=r"edge_weights: 2 of 4 edges have no positive weight \(edge 1: nan\)"):
+        match(trace, graph, edge_weights=pd.Series([1.0, np.nan, 0.0, 1.0]))
+
+
+def test_a_stretch_off_the_network_parts_the_path() -> None:
+    graph = graph_from_lines([[(0, 0), (300, 0)], [(300, 0), (900, 0)]], crs=CRS)
+    found = match(fleet(along((10, 0), (290, 0), (290, 300), (500, 300), (500, 0), (890, 0))), graph)
+    assert found.steps["part"].tolist() == [0, 1]
+    assert found.steps["entered"].tolist() == [False, False]
+    assert found.fixes["reason"].dropna().isin(["no edge within 60 m", "edges near, but none fits"]).all()
+    assert found.fixes["edge"].isna().sum() > 40
+    assert turn_counts(found, graph).empty
+
+
+def test_a_trace_without_an_edge_near() -> None:
+    graph = graph_from_lines([[(0, 0), (100, 0)]], crs=CRS)
+    for profile, words in (("fleet", "within 60 m"), ("sparse", "within 80 m"), ("published", "within 150 m")):
+        found = match(fleet(along((0, 900), (100, 900))), graph, MatchOptions(profile=profile))
+        assert found.fixes["edge"].isna().all()
+        assert found.fixes["reason"].eq(f"no edge {words}").all()
+        assert found.steps.empty
+        assert turn_counts(found, graph).empty
+
+
+@pytest.mark.parametrize("profile", ["auto", "published"])
+def test_an_empty_graph_matches_nothing(profile: str) -> None:
+    found = match(fleet([(0, 0), (9, 0)]), empty_graph(CRS), MatchOptions(profile=profile))
+    assert found.fixes["reason"].tolist() == ["the graph has no edges"] * 2
+    assert found.steps.empty
+
+
+@pytest.mark.parametrize("profile", ["auto", "sparse", "published"])
+def test_a_trace_of_one_fix(profile: str) -> None:
+    graph = graph_from_lines([[(0, 0), (100, 0)]], crs=CRS)
+    found = match(fleet([(30, 5)]), graph, MatchOptions(profile=profile))
+    assert found.fixes[["edge", "offset", "distance"]].to_numpy().tolist() == [[0, 30.0, 5.0]]
+    assert driven(found) == [(0, True)]
+
+
+@pytest.mark.parametrize("profile", ["fleet", "sparse", "published"])
+def test_edges_without_length_are_passed(profile: str) -> None:
+    nodes = gpd.GeoDataFrame(geometry=shapely.points([(0, 0), (100, 0), (100, 0), (200, 0)]), crs=CRS)
+    lines = shapely.linestrings([[(0, 0), (100, 0)], [(100, 0), (100, 0)], [(100, 0), (200, 0)]])
+    edges = gpd.GeoDataFrame({"u": [0, 1, 2], "v": [1, 2, 3]}, geometry=lines, crs=CRS)
+    graph = RoadGraph(nodes, finish_edges(edges), empty_turns())
+    found = match(fleet(along((5, 1), (195, 1), spacing=5.0)), graph, MatchOptions(profile=profile))
+    edge = [edge for edge, _ in driven(found)]
+    assert edge == [0, 1, 2] or profile == "published"  # which passes one state for each observation
+    assert {edge[0], edge[-1]} == {0, 2}
+
+
+def test_missing_altitudes_change_nothing() -> None:
+    graph = stacked_roads()
+    xy = along((10, 30), (190, 30))
+    plain = match(fleet(xy), graph)
+    for z in (np.nan, np.where(np.arange(len(xy)) % 2, np.nan, 0.0)):
+        assert match(fleet(xy, z=z), graph).fixes.equals(plain.fixes)
+
+
+def test_another_crs_is_refused() -> None:
+    graph = graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32617")
+    with pytest.raises(CRSError, match=r"the traces are in WGS 84 / UTM zone 16N, the graph is in .* 17N; reproject"):
+        match(fleet([(0, 0), (9, 0)]), graph)
+
+
+def test_turns_on_another_graph_are_refused() -> None:
+    graph = graph_from_lines(CROSSING, crs=CRS)
+    found = match(fleet(along((-190, 0), (190, 0))), graph)
+    with pytest.raises(InputError, match="edge 1 of the matches is not in the graph"):
+        turn_counts(found, graph_from_lines(CROSSING[:1], crs=CRS))
+
+
+def test_auto_takes_the_profile_of_the_interval() -> None:
+    graph = graph_from_lines(CROSSING, crs=CRS)
+    xy = along((-190, 3), (190, 3), spacing=20.0)
+    for interval, profile in ((4.0, "fleet"), (6.0, "sparse")):
+        trace = fleet(xy, interval=interval)
+        chosen = match(trace, graph, MatchOptions(profile=profile))
+        assert match(trace, graph).fixes.equals(chosen.fixes)
+
+
+def test_traces_of_both_profiles_in_one_fleet_keep_their_order() -> None:
+    graph = graph_from_lines(CROSSING, crs=CRS)
+    parts = []
+    for number in range(6):
+        xy = along((-190, 3), (190, 3), spacing=20.0)
+        step = 10.0 if number % 2 else 1.0
+        parts.append(pd.DataFrame({"trace_id": number, "t": step * np.arange(len(xy)), "x": xy[:, 0], "y": xy[:, 1]}))
+    table = pd.concat(parts, ignore_index=True)
+    found = match(fleet_from_tables(table, crs=CRS, target_crs=CRS), graph)
+    assert found.fixes["trace_id"].tolist() == table["trace_id"].tolist()
+    assert found.steps["trace_id"].tolist() == np.repeat(np.arange(6), 2).tolist()
+    assert found.steps["position"].tolist() == [0, 1] * 6
+    assert found.fixes["edge"].tolist() == [int(x > 0) for x in table["x"]]
+
+
+def test_published_emission() -> None:
+    table = emission_table(PublishedModel())
+    assert table[[0, 10, 25, 50, 100, 116, 149]].round(4).tolist() == [
+        0.5,
+        0.4207,
+        0.3085,
+        0.1587,
+        0.0228,
+        0.0102,
+        0.0014,
+    ]
+    assert len(table) == 150
+
+
+def test_published_transitions() -> None:
+    lines = [[(-9, 0), (0, 0)], [(0, 0), (9, 0)], [(0, 0), (0, 9)], [(9, 0), (19, 0)]]
+    states = build_states(graph_from_lines(lines, crs=CRS))
+    weight = np.array([1.0, 1.0, 0.1, 1.0])
+    onward = 1 - 0.5 - 1e-5
+    assert transition(states, weight, 0, 0) == 0.5
+    assert transition(states, weight, 0, 2) == pytest.approx(onward / 2.1)
+    assert transition(states, weight, 0, 4) == pytest.approx(onward * 0.1 / 2.1)
+    assert transition(states, weight, 0, 1) == 1e-5  # three edges leave the node
+    assert transition(states, weight, 2, 6) == pytest.approx(onward / 2)  # the reverse edge has its share
+    assert transition(states, weight, 2, 3) == 0.0  # two edges leave the node: no turning back in a chain
+    assert transition(states, weight, 6, 7) == 1e-5  # dead end
+    assert transition(states, weight, 0, 6) == 0.0
+
+
+def brute_force(states_xy: list[tuple[float, float]], graph: RoadGraph, model: PublishedModel) -> list[int]:
+    """Viterbi over all states with full matrices, straight from the definition; -1 is unknown."""
+    states = build_states(graph)
+    n = len(states.head)
+    weight = np.ones(n // 2)
+    matrix = np.zeros((n + 1, n + 1))
+    for before in range(n):
+        for after in range(n):
+            matrix[before, after] = transition(states, weight, before, after, model)
+    matrix[:n, n], matrix[n, :n], matrix[n, n] = model.leave, model.enter / n, model.stay_unknown
+    table = emission_table(model)
+    probability, back = np.eye(n + 1)[n], []
+    for x, y in states_xy:
+        metres = np.floor(graph.edges.distance(shapely.Point(x, y)).to_numpy()).astype(int)
+        emission = np.repeat(np.append(table, np.zeros(10**4))[metres], 2)
+        reached = probability[:, None] * matrix
+        back.append(reached.argmax(axis=0))
+        probability = reached.max(axis=0) * np.append(emission, model.unknown)
+        probability /= probability.sum()
+    path = [int(probability.argmax())]
+    for column in back[:0:-1]:
+        path.append(int(column[path[-1]]))
+    return [-1 if state == n else state for state in reversed(path)]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_published_equals_viterbi_over_full_matrices(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = graph_from_lines([*CROSSING, [(0, 200), (200, 200)], [(200, 200), (200, 0)]], crs=CRS)
+    corners = rng.choice(np.array([(-190, 0), (0, 0), (200, 0), (200, 200), (0, 190), (0, -190)]), 4, replace=False)
+    xy = along(*map(tuple, corners), spacing=9.0)
+    xy = xy + np.cumsum(rng.normal(0, 3.0, xy.shape), axis=0)
+    xy = xy[: 1 + int(np.argmax(np.append(np.hypot(*np.diff(xy, axis=0).T) > 10.0, True)))]  # no interpolated fixes
+    model = PublishedModel(memory=1000)
+    found = match(fleet(xy), graph, MatchOptions(profile="published", published=model))
+    state = 2 * found.fixes["edge"] + (~found.fixes["forward"]).astype("Int64")
+    assert state.fillna(-1).tolist() == brute_force([tuple(place) for place in xy], graph, model)
+
+
+def test_published_decides_with_bounded_memory() -> None:
+    graph = graph_from_lines(CROSSING, crs=CRS)
+    xy = along((-190, 4), (0, 4), (4, 190))
+    long, short = (
+        match(fleet(xy), graph, MatchOptions(profile="published", published=PublishedModel(memory=memory)))
+        for memory in (300, 25)
+    )
+    assert driven(long) == driven(short) == [(0, True), (3, True)]
+
+
+def test_options_come_from_tables_and_are_checked() -> None:
+    options = options_from_table({"profile": "fleet", "fleet": {"sigma": 7}}, MatchOptions)
+    assert options.fleet.sigma == 7.0
+    with pytest.raises(OptionError, match="profile is 'quick'; use auto, fleet"):
+        MatchOptions(profile="quick")
+    with pytest.raises(OptionError, match="RouteModel: sigma is 0; use a positive number"):
+        RouteModel(sigma=0)
+    with pytest.raises(OptionError, match="PublishedModel: stay is 2; use at most 1"):
+        PublishedModel(stay=2)
+
+
+DATA = (
+    Path(os.environ.get("PROBE2ROAD_DATA", Path(__file__).parents[2] / "shared" / "data")) / "mapmatching" / "kubicka"
+)
