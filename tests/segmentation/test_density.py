@@ -11,7 +11,6 @@ from probe2road.segmentation.density import (
     DensityOptions,
     density_probability,
     density_segmenter,
-    estimate_bandwidth,
 )
 
 CRS = "EPSG:32616"
@@ -74,14 +73,6 @@ def test_windows_with_a_halo_agree_with_the_whole():
         at_border = rows.start == 0 or cols.start == 0 or rows.stop == grid.rows or cols.stop == grid.cols
         where = inner if at_border else (slice(None), slice(None))
         np.testing.assert_allclose(part[where], core[where], atol=1e-6)
-
-
-def test_precise_traces_need_a_fine_kernel_and_noisy_ones_a_broad_one():
-    precise = fleet_of_lines([0.0, 200.0], 30, noise=0.5)
-    noisy = fleet_of_lines([0.0, 200.0], 30, noise=8.0)
-    fine, broad = (estimate_bandwidth(fleet, fleet_grid(fleet)) for fleet in (precise, noisy))
-    assert fine <= 6.0
-    assert broad > 1.5 * fine
 
 
 def test_no_traces_give_no_road():

@@ -14,10 +14,9 @@ bloom until they swallow their neighbours. Three things make it safe, and the pr
 * presence: traces close by, at a third of the bandwidth. Outside the corner of a busy road the tail of the
   density is a ridge too, but nobody drove there.
 
-The bandwidth decides which traces are one road. It is taken from the data: a ladder of bandwidths is climbed
-until the network stops falling apart into single traces, which shows as the length of all ridges no longer
-shrinking from one rung to the next. Metre-level fleet data settles at the bottom of the ladder, consumer GNSS
-in a city near its top, and neither needs a parameter.
+The bandwidth decides which traces are one road. It follows from how far the traces of one road lie apart, which
+the data tell (`probe2road.segmentation.bandwidth`): metre-level fleet data gets a fine kernel, consumer GNSS in a
+city a broad one, and neither needs a parameter.
 """
 
 from __future__ import annotations
@@ -33,21 +32,15 @@ from scipy import ndimage
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, TraceGaps
 from probe2road.grid import Grid
-from probe2road.raster import rasterize_windows
+from probe2road.segmentation.bandwidth import estimate_bandwidth
 from probe2road.segmentation.segmenter import Segmenter
-from probe2road.skeleton import skeletonize
 
-__all__ = ["DensityOptions", "density_probability", "density_segmenter", "estimate_bandwidth"]
+__all__ = ["DensityOptions", "density_probability", "density_segmenter"]
 
 logger = logging.getLogger(__name__)
 
 _TRUNCATE = 4.5  # kernel half-width, bandwidths; a shorter one ends in a step that curves like a ridge
 _CLOSE_BY = 1 / 3  # bandwidths
-_LADDER = (3.0, 3.75, 4.7, 5.9, 7.3, 9.1, 11.4)  # m, each a quarter more than the one before
-_SETTLED = 1.05  # ridge length over that of the next rung, below which the network holds together
-_COMFORT = 1.5  # bandwidth used over the finest that holds the network together
-_SAMPLE_WINDOW = 1000.0  # m, side of the windows the bandwidth is estimated on
-_SAMPLE_WINDOWS = 6  # how many, those with the most traffic
 
 
 @dataclass(frozen=True)
@@ -96,7 +89,7 @@ def density_segmenter(
     """
     options = options or DensityOptions()
     if options.bandwidth is None:
-        options = replace(options, bandwidth=estimate_bandwidth(fleet, grid, options, gaps=gaps))
+        options = replace(options, bandwidth=estimate_bandwidth(fleet, grid, gaps=gaps))
     settled = options
     assert settled.bandwidth is not None
 
@@ -156,40 +149,6 @@ def density_probability(trace_counts: NDArray[np.uint32], grid: Grid, options: D
         for s in (sigma, sigma * _CLOSE_BY)
     )
     return _least(evidence, presence, sigma, options.half_evidence, options.half_presence, options.half_ridge)
-
-
-def estimate_bandwidth(
-    fleet: Fleet, grid: Grid, options: DensityOptions | None = None, *, gaps: TraceGaps | None = None
-) -> float:
-    """Return a bandwidth (m) at which the network does not fall apart into single traces.
-
-    Measured on the windows with the most traffic: one and a half times the rung of a ladder from which on
-    coarser rungs shorten the network by less than a twentieth each. The order and the direction of the traces
-    do not matter, nor do changes too small to move the result to another rung.
-
-    Returns
-    -------
-    float
-        Metres, 4.5 to 17.
-    """
-    options = options or DensityOptions()
-    size = round(_SAMPLE_WINDOW / grid.resolution)
-    traffic = {window: int(counts[0].sum()) for window, counts in rasterize_windows(fleet, grid, size=size, gaps=gaps)}
-    busiest = set(sorted(traffic, key=lambda window: (-traffic[window], window.row, window.col))[:_SAMPLE_WINDOWS])
-    windows = rasterize_windows(fleet, grid, size=size, gaps=gaps)
-    samples = [counts[0] for window, counts in windows if window in busiest]
-    everywhere = replace(options, half_presence=0.0)
-    lengths = np.array([_ridge_length(samples, grid, replace(everywhere, bandwidth=rung)) for rung in _LADDER])
-    falling = np.flatnonzero(lengths[:-1] >= _SETTLED * lengths[1:])
-    finest = _LADDER[falling[-1] + 1] if falling.size else _LADDER[0]
-    logger.info("bandwidth %.1f m: ridges settle at %.1f m", _COMFORT * finest, finest)
-    return _COMFORT * finest
-
-
-def _ridge_length(samples: list[NDArray[np.uint32]], grid: Grid, options: DensityOptions) -> int:
-    """Count the pixels of the thinned ridges."""
-    masks = (density_probability(sample, grid, options) >= options.threshold for sample in samples)
-    return sum(int(skeletonize(mask).sum()) for mask in masks)
 
 
 def _halo(bandwidth: float, grid: Grid) -> int:
