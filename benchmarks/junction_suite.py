@@ -24,7 +24,7 @@ from probe2road.fleet import Fleet
 from probe2road.fleet_tables import empty_points
 from probe2road.gaps import fill_gaps, gap_weights, prune_gaps
 from probe2road.mapmatch import Matches, match
-from probe2road.passages import junction_altitudes
+from probe2road.passages import passing_positions
 from probe2road.recipe import build
 from probe2road.roadgraph import RoadGraph, finish_edges
 from probe2road.simulate.crossings import find_crossings
@@ -200,10 +200,24 @@ def confusion(graph: RoadGraph, plan: PlanGraph) -> tuple[int, int, int]:
     return int((said & true).sum()), int((said & ~true).sum()), int((~said & true).sum())
 
 
-def of_repetitions(matches: Matches, heights: pd.DataFrame, repetition: pd.Series, k: int) -> tuple[pd.DataFrame, ...]:
-    """Return steps and heights of the first k repetitions."""
+def of_repetitions(
+    matches: Matches, positions: pd.DataFrame, repetition: pd.Series, k: int
+) -> tuple[pd.DataFrame, ...]:
+    """Return steps and positions of the first k repetitions."""
     chosen = repetition.index[repetition < k]
-    return matches.steps[matches.steps["trace_id"].isin(chosen)], heights[heights["trace_id"].isin(chosen)]
+    return matches.steps[matches.steps["trace_id"].isin(chosen)], positions[positions["trace_id"].isin(chosen)]
+
+
+def split_with(
+    graph: RoadGraph,
+    steps: pd.DataFrame,
+    positions: pd.DataFrame,
+    options: DisambiguateOptions,
+    with_heights: bool,
+) -> RoadGraph:
+    """Split a graph, with or without the heights of the traces."""
+    known = positions if with_heights else positions.assign(z=np.nan)
+    return split_false_junctions(graph, steps, positions=known, options=options)
 
 
 def score_plan(name: str, preset: str, counts: Iterable[int], *, seed: int) -> pd.DataFrame:
@@ -213,16 +227,14 @@ def score_plan(name: str, preset: str, counts: Iterable[int], *, seed: int) -> p
     counts = list(counts)
     fleet, repetition = drive_movements(network, preset, max(max(counts), 1), seed=seed)
     matches = match(fleet, plan.graph)
-    heights = junction_altitudes(fleet, matches, plan.graph)
+    positions = passing_positions(fleet, matches, plan.graph)
     rows = []
     for k in counts:
-        steps, known = of_repetitions(matches, heights, repetition, k)
+        steps, known = of_repetitions(matches, positions, repetition, k)
         for variant, (options, with_heights) in VARIANTS.items():
             split = plan.graph
             if options is not None:
-                split = split_false_junctions(
-                    plan.graph, steps, heights=known if with_heights else None, options=options
-                )
+                split = split_with(plan.graph, steps, known, options, with_heights)
             rows.append((name, preset, seed, k, variant, *confusion(split, plan)))
     return pd.DataFrame(rows, columns=["kind", "preset", "seed", "drives", "variant", "tp", "fp", "fn"])
 
@@ -241,14 +253,12 @@ def score_builds(name: str, preset: str, counts: Iterable[int], *, seed: int) ->
         filled = fill_gaps(built)
         joined = prune_gaps(filled, match(some, filled, edge_weights=gap_weights(filled)).steps)
         matches = match(some, joined)
-        heights = junction_altitudes(some, matches, joined)
+        positions = passing_positions(some, matches, joined)
         graphs = {"segmentation": built}
         for variant, (options, with_heights) in VARIANTS.items():
             graphs[variant] = joined
             if options is not None:
-                graphs[variant] = split_false_junctions(
-                    joined, matches.steps, heights=heights if with_heights else None, options=options
-                )
+                graphs[variant] = split_with(joined, matches.steps, positions, options, with_heights)
         rows += [(name, preset, seed, k, what, *_met(graph, arms, plan.truth)) for what, graph in graphs.items()]
     return pd.DataFrame(rows, columns=["kind", "preset", "seed", "drives", "variant", "tp", "fp", "fn"])
 

@@ -41,6 +41,7 @@ class DisambiguateOptions:
     min_count: int = 4  # passages from which two edge ends are connected (METHOD 0.1 row 23)
     min_share: float = 0.05  # of the less driven end's passages that a pair must have; below are matching errors
     max_inner: float = 40.0  # m; shorter edges between two junctions may be artefacts of a crossing; 0 trusts all
+    min_apart: float = 3.0  # m between the traces of two roads at both nodes of an artefact; on one road they coincide
     min_height: float = 4.0  # m between traces on stacked roads
     confidence: float = 2.0  # standard errors by which a height difference must differ from none
     merge: bool = True  # whether nodes of degree 2 are merged afterwards
@@ -50,7 +51,7 @@ class DisambiguateOptions:
         if self.variant not in VARIANTS:
             fault = f"variant is {self.variant!r}"
             raise OptionError(fault, where="DisambiguateOptions", fix=f"use {' or '.join(VARIANTS)}")
-        for name in ("min_count", "min_share", "max_inner", "min_height", "confidence"):
+        for name in ("min_count", "min_share", "max_inner", "min_apart", "min_height", "confidence"):
             if not getattr(self, name) >= 0:
                 fault = f"{name} is {getattr(self, name)}"
                 raise OptionError(fault, where="DisambiguateOptions", fix="use a number that is not negative")
@@ -60,7 +61,7 @@ def split_false_junctions(
     graph: RoadGraph,
     steps: pd.DataFrame,
     *,
-    heights: pd.DataFrame | None = None,
+    positions: pd.DataFrame | None = None,
     options: DisambiguateOptions | None = None,
 ) -> RoadGraph:
     """Take junctions apart where no traces connect the edges that meet there.
@@ -71,12 +72,12 @@ def split_false_junctions(
 
     The guarded variant splits a node only into groups that traces prove: two groups at least must hold a connected
     pair. Every other end stays with the group that traces connect it to most often, or else with the group that it
-    continues most nearly straight. It also
+    continues most nearly straight. Where positions are given, it also
 
     * looks at each edge up to ``max_inner`` between two junctions as if it and its nodes were one junction. Where
-      traces use it in two ways that never mix, it is an artefact of roads that cross at a flat angle: it is removed,
-      and both roads are led straight on without a common node;
-    * uses heights, where they are given. A road with fewer than ``min_count`` passages is split off if its traces are
+      traces use it in two ways that never mix, and are apart at both of its nodes, it is an artefact of roads that
+      cross at a flat angle: it is removed, and both roads are led straight on without a common node;
+    * uses the heights of the traces. A road with fewer than ``min_count`` passages is split off if its traces are
       ``min_height`` above or below the others, and roads that cross at one level stay connected.
 
     Parameters
@@ -85,8 +86,8 @@ def split_false_junctions(
         Any road graph.
     steps
         Paths matched on it: `probe2road.mapmatch.Matches.steps`.
-    heights
-        Result of `probe2road.passages.junction_altitudes`; only the guarded variant uses them.
+    positions
+        Result of `probe2road.passages.passing_positions`; only the guarded variant uses them.
     options
         The defaults where it is None.
 
@@ -126,7 +127,7 @@ def split_false_junctions(
         passages, result = single, split_nodes(graph, places_at_nodes(graph), group)
         n_removed = 0
     else:
-        passages, result, n_removed = _guarded(graph, node_passages(graph, steps, heights), options)
+        passages, result, n_removed = _guarded(graph, node_passages(graph, steps, positions), options)
     result = replace(result, turns=_turns(graph, result, passages))
     logger.info(
         "split false junctions: %d nodes became %d, %d artefact edges removed",
@@ -143,10 +144,10 @@ def _guarded(graph: RoadGraph, single: Passages, options: DisambiguateOptions) -
     group = proven_groups(evidence(at_nodes, single), directions, rules)
 
     inner = _possible_artefacts(graph, options.max_inner)
-    double = double_passages(graph, single, inner)
+    double, at_ends = double_passages(graph, single, inner)
     around = places_around(graph, inner)
     outer_group = proven_groups(evidence(around, double), directions, rules)
-    removed = _artefacts(graph, around, outer_group, double)
+    removed = _artefacts(graph, around, outer_group, double, at_ends, options.min_apart)
 
     # What is one artefact is not also split node by node.
     ends = graph.edges[["u", "v"]].to_numpy()[removed].ravel()
@@ -170,24 +171,40 @@ def _possible_artefacts(graph: RoadGraph, max_length: float) -> NDArray[np.int64
     return np.flatnonzero(between & short.to_numpy())
 
 
-def _artefacts(graph: RoadGraph, around: Places, group: NDArray[np.int64], double: Passages) -> NDArray[np.int64]:
-    """Rows of edges that traces of two groups of ends or more pass over; of two that share a node, the shorter."""
-    u, v = graph.edges[["u", "v"]].to_numpy().T
-    node = np.stack([u, v], axis=1).reshape(-1)
-    over = node[double.came] != node[double.went]
+def _artefacts(
+    graph: RoadGraph,
+    around: Places,
+    group: NDArray[np.int64],
+    double: Passages,
+    at_ends: NDArray[np.float64],
+    min_apart: float,
+) -> NDArray[np.int64]:
+    """Rows of edges that traces of two groups of ends pass over, apart; of two that share a node, the shorter."""
+    over = slice(0, len(at_ends))
     came, went = (group[around.find(double.junction[over], ends[over])] for ends in (double.came, double.went))
-    within = pd.DataFrame({"row": double.junction[over] - len(graph.nodes), "group": came})[came == went]
-    n_groups = within.drop_duplicates()["row"].value_counts()
-    found = n_groups.index[n_groups >= 2].to_numpy(np.int64)
-    middle = shapely.line_interpolate_point(graph.edges.geometry.to_numpy()[found], 0.5, normalized=True)
-    order = np.lexsort([*shapely.get_coordinates(middle).T, graph.edges["length"].to_numpy()[found]])
+    table = pd.DataFrame(at_ends.reshape(-1, 4)).assign(row=double.junction[over] - len(graph.nodes), group=came)
+    middle = table[came == went].groupby(["row", "group"]).median()
+    found = [row for row, places in middle.groupby(level="row") if _are_apart(places.to_numpy(), min_apart)]
+    u, v = graph.edges[["u", "v"]].to_numpy().T
+    length = graph.edges["length"].to_numpy()
+    centre = shapely.line_interpolate_point(graph.edges.geometry.to_numpy()[found], 0.5, normalized=True)
+    order = np.lexsort([*shapely.get_coordinates(centre).T, length[found]]) if found else np.zeros(0, np.int64)
     taken: set[int] = set()
     removed = []
-    for row in found[order]:
+    for row in np.array(found, np.int64)[order]:
         if u[row] not in taken and v[row] not in taken:
             taken |= {u[row], v[row]}
             removed.append(row)
     return np.array(removed, np.int64)
+
+
+def _are_apart(places: NDArray[np.float64], least: float) -> bool:
+    """Tell whether two groups or more are all apart at both nodes; rows are groups, columns x, y, x, y."""
+    if len(places) < 2:
+        return False
+    one, other = np.triu_indices(len(places), 1)
+    away = (places[one] - places[other]).reshape(-1, 2, 2)
+    return bool((np.hypot(away[..., 0], away[..., 1]) >= least).all())
 
 
 def _turns(before: RoadGraph, after: RoadGraph, passages: Passages) -> pd.DataFrame:

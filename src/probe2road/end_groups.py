@@ -80,7 +80,12 @@ def evidence(places: Places, passages: Passages) -> Evidence:
     """Count passages between places, both directions together, and collect their heights."""
     one, other = (places.find(passages.junction, end) for end in (passages.came, passages.went))
     table = pd.DataFrame(
-        {"one": np.minimum(one, other), "other": np.maximum(one, other), "trace": passages.trace, "z": passages.z}
+        {
+            "one": np.minimum(one, other),
+            "other": np.maximum(one, other),
+            "trace": passages.trace,
+            "z": passages.xyz[:, 2],
+        }
     )
     pairs = table.groupby(["one", "other"]).size().rename("count").reset_index()
     keyed = table.merge(pairs.reset_index(names="pair"), on=["one", "other"])

@@ -1,4 +1,4 @@
-"""Passages: what traces did at the junctions of a graph, from edge end to edge end, and how high they were.
+"""Passages: what traces did at the junctions of a graph, from edge end to edge end, and where they were then.
 
 Strategy
 --------
@@ -28,13 +28,13 @@ __all__ = [
     "Passages",
     "Places",
     "double_passages",
-    "junction_altitudes",
     "node_passages",
+    "passing_positions",
     "places_around",
     "places_at_nodes",
 ]
 
-_FAR = 60.0  # m; between two fixes farther apart, heights are not interpolated
+_FAR = 60.0  # m; between two fixes farther apart, positions are not interpolated
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Passages:
     came: NDArray[np.int64]  # (n,) edge end
     went: NDArray[np.int64]  # (n,) edge end
     trace: NDArray[np.int64]  # (n,) number of the trace
-    z: NDArray[np.float64]  # (n,) m, NaN where unknown
+    xyz: NDArray[np.float64]  # (n, 3) m, where the trace was; NaN where unknown
     step: NDArray[np.int64]  # (n,) row of the steps table, of the step after the junction
 
     def where(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> Passages:
@@ -93,12 +93,12 @@ def places_around(graph: RoadGraph, inner: NDArray[np.int64]) -> Places:
     return Places(near["edge"].to_numpy(np.int64) + len(graph.nodes), near["end"].to_numpy(np.int64))
 
 
-def junction_altitudes(fleet: Fleet, matches: Matches, graph: RoadGraph) -> pd.DataFrame:
-    """Return how high every trace was when it passed a node.
+def passing_positions(fleet: Fleet, matches: Matches, graph: RoadGraph) -> pd.DataFrame:
+    """Return where every trace was when it passed a node.
 
-    Heights are those of the traces themselves, interpolated in time between the fixes around the node. One trace is
-    metres off, and by nearly the same all along its drive: heights at one junction are to be compared between many
-    traces, not believed one by one.
+    Positions are those of the traces themselves, interpolated in time between the fixes around the node. One trace is
+    metres off, most of all in height, and by nearly the same all along its drive: positions at one junction are to be
+    compared between many traces, not believed one by one.
 
     Parameters
     ----------
@@ -112,8 +112,8 @@ def junction_altitudes(fleet: Fleet, matches: Matches, graph: RoadGraph) -> pd.D
     Returns
     -------
     DataFrame
-        ``trace_id``, ``position`` (of the step after the node), ``via_node``, ``z`` (m; NaN where the trace has no
-        heights or no clock, or no fixes near the node).
+        ``trace_id``, ``position`` (of the step after the node), ``via_node``, ``x``, ``y``, ``z`` (m; NaN where the
+        trace has no clock or no fixes near the node, ``z`` also where it has no heights).
 
     Raises
     ------
@@ -128,28 +128,32 @@ def junction_altitudes(fleet: Fleet, matches: Matches, graph: RoadGraph) -> pd.D
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(4), "x": [70.0, 90, 110, 130], "y": 0.0, "z": [4.0, 5, 7, 8]})
     >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
-    >>> junction_altitudes(fleet, match(fleet, graph), graph).values.tolist()
-    [[1.0, 1.0, 1.0, 6.0]]
+    >>> passing_positions(fleet, match(fleet, graph), graph).values.tolist()
+    [[1.0, 1.0, 1.0, 100.0, 0.0, 6.0]]
     """
     steps = matches.steps
     entered = steps["entered"].to_numpy(bool)
     via = steps["via_node"].to_numpy(np.int64, na_value=-1)
     if not np.isin(via[entered], graph.nodes.index).all():
-        raise InputError("the matches name nodes that are not in the graph", where="junction_altitudes")
+        raise InputError("the matches name nodes that are not in the graph", where="passing_positions")
     first, last = (steps[name].to_numpy("datetime64[ns]") for name in ("t_first", "t_last"))
     trace = steps["trace_id"]
     before = pd.Series(last).groupby(trace.to_numpy()).ffill().shift(1).to_numpy()
     after = pd.Series(first).groupby(trace.to_numpy()).bfill().to_numpy()
     known = entered & ~np.isnat(before) & ~np.isnat(after)
-    z = np.full(len(steps), np.nan)
+    xyz = np.full((len(steps), 3), np.nan)
     middle = before[known] + (after[known] - before[known]) // 2
     place = shapely.get_coordinates(graph.nodes.geometry[via[known]].to_numpy())
-    z[known] = _heights_at(fleet, trace[known], middle, place)
-    table = steps[["trace_id", "position", "via_node"]].assign(z=z)[entered].reset_index(drop=True)
+    xyz[known] = _interpolated(fleet, trace[known], middle, place)
+    table = (
+        steps[["trace_id", "position", "via_node"]]
+        .assign(**dict(zip("xyz", xyz.T, strict=True)))[entered]
+        .reset_index(drop=True)
+    )
     return table.astype({"via_node": "int64"})
 
 
-def node_passages(graph: RoadGraph, steps: pd.DataFrame, heights: pd.DataFrame | None = None) -> Passages:
+def node_passages(graph: RoadGraph, steps: pd.DataFrame, positions: pd.DataFrame | None = None) -> Passages:
     """Return the passages over single nodes: one for each step that was entered over a node.
 
     Raises
@@ -166,15 +170,18 @@ def node_passages(graph: RoadGraph, steps: pd.DataFrame, heights: pd.DataFrame |
     went = 2 * row + np.where(forward, 0, 1)
     came = 2 * row + np.where(forward, 1, 0)
     node = end_nodes(*_end_rows(graph))
-    z = np.full(len(onto), np.nan)
-    if heights is not None:
+    xyz = np.full((len(onto), 3), np.nan)
+    if positions is not None:
         keys = ["trace_id", "position"]
-        z = steps.iloc[onto][keys].merge(heights[[*keys, "z"]], on=keys, how="left")["z"].to_numpy(np.float64)
+        known = steps.iloc[onto][keys].merge(positions[[*keys, *"xyz"]], on=keys, how="left")
+        xyz = known[[*"xyz"]].to_numpy(np.float64)
     trace = pd.factorize(steps["trace_id"])[0][onto]
-    return Passages(node[went[onto]], came[onto - 1], went[onto], trace, z, onto)
+    return Passages(node[went[onto]], came[onto - 1], went[onto], trace, xyz, onto)
 
 
-def double_passages(graph: RoadGraph, single: Passages, inner: NDArray[np.int64]) -> Passages:
+def double_passages(
+    graph: RoadGraph, single: Passages, inner: NDArray[np.int64]
+) -> tuple[Passages, NDArray[np.float64]]:
     """Return the passages over edges taken as junctions, together with their two nodes.
 
     Parameters
@@ -189,8 +196,11 @@ def double_passages(graph: RoadGraph, single: Passages, inner: NDArray[np.int64]
     Returns
     -------
     Passages
-        Over the inner edge from outer end to outer end, and past it at one of its nodes. A trace that begins, ends or
-        turns back on the inner edge does not count.
+        First those over the inner edge from outer end to outer end, then those past it at one of its nodes. A trace
+        that begins, ends or turns back on the inner edge does not count.
+    ndarray of float64
+        Shape (k, 2, 2): x and y (m) of the traces of the first k passages, those over the inner edge, when they passed
+        its start and when they passed its end.
     """
     n_nodes = len(graph.nodes)
     is_inner = np.zeros(len(graph.edges), bool)
@@ -205,15 +215,18 @@ def double_passages(graph: RoadGraph, single: Passages, inner: NDArray[np.int64]
         single.where(off),
         junction=n_nodes + single.went[onto] // 2,
         came=single.came[onto],
-        z=(single.z[onto] + single.z[off]) / 2,
+        xyz=(single.xyz[onto] + single.xyz[off]) / 2,
     )
+    at_ends = np.stack([single.xyz[onto, :2], single.xyz[off, :2]], axis=1)
+    backwards = single.went[onto] % 2 == 1
+    at_ends[backwards] = at_ends[backwards, ::-1]
     u, v = _end_rows(graph)
     near = pd.DataFrame({"node": np.concatenate([u[inner], v[inner]]), "edge": np.tile(inner, 2)})
     past = pd.DataFrame({"node": single.junction, "at": np.arange(len(single.junction))}).merge(near, on="node")
     at, edge = past["at"].to_numpy(), past["edge"].to_numpy()
     outside = (single.came[at] // 2 != edge) & (single.went[at] // 2 != edge)
     beside = replace(single.where(at[outside]), junction=n_nodes + edge[outside])
-    return Passages.joined(over, beside)
+    return Passages.joined(over, beside), at_ends
 
 
 def _end_rows(graph: RoadGraph) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -222,10 +235,10 @@ def _end_rows(graph: RoadGraph) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return u, v
 
 
-def _heights_at(
+def _interpolated(
     fleet: Fleet, trace_id: pd.Series, moment: NDArray[np.datetime64], place: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Interpolate the heights of traces at moments, NaN where no fixes are near the places; shape (n,)."""
+    """Interpolate the positions of traces at moments, NaN where no fixes are near the places; shape (n, 3)."""
     starts = fleet.starts
     names = pd.Index(fleet.traces["trace_id"].to_numpy()[starts[:-1]])
     trace = names.get_indexer(trace_id)
@@ -239,12 +252,12 @@ def _heights_at(
     row_after = pd.merge_asof(wanted, fixes, on="t", by="trace", direction="forward").set_index("order")["row"]
     a, b = (rows.sort_index().to_numpy(np.float64) for rows in (row_before, row_after))
     known = np.isfinite(a) & np.isfinite(b)
-    z = np.full(len(moment), np.nan)
+    result = np.full((len(moment), 3), np.nan)
     i, j = a[known].astype(np.int64), b[known].astype(np.int64)
     xyz = fleet.traces[["x", "y", "z"]].to_numpy(np.float64)
     span = (clock[j] - clock[i]) / np.timedelta64(1, "s")
     share = np.divide((moment[known] - clock[i]) / np.timedelta64(1, "s"), span, out=np.zeros(len(i)), where=span > 0)
     near = np.hypot(*(xyz[j, :2] - xyz[i, :2]).T) <= _FAR
     near &= np.hypot(*(xyz[i, :2] - place[known]).T) <= _FAR
-    z[known] = np.where(near, xyz[i, 2] + share * (xyz[j, 2] - xyz[i, 2]), np.nan)
-    return z
+    result[known] = np.where(near[:, None], xyz[i] + share[:, None] * (xyz[j] - xyz[i]), np.nan)
+    return result
