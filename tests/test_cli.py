@@ -57,7 +57,7 @@ def built(folder):
 
 
 def test_build_writes_every_output_and_leaves_nothing_else(folder, built):
-    assert len(read_graph(folder / "roads.gpkg").edges) == len(read_graph(folder / "roads.geojson").edges) == 4
+    assert len(read_graph(folder / "roads.gpkg").edges) == len(read_graph(folder / "roads.geojson").edges) == 2
     assert not list(folder.glob(".*"))
     assert "segmented" in built.stderr
 
@@ -73,7 +73,7 @@ def test_evaluate_prints_scores_with_their_parameters(folder, built, call):
 def test_info_tells_fleet_data_from_a_graph(built, call):
     fleet, graph = (json.loads(call("info", *words)[1]) for words in (("drives.csv", *COLUMNS), ("roads.gpkg",)))
     assert (fleet["content"], fleet["traces"]) == ("fleet data", 12)
-    assert (graph["content"], graph["junctions"]) == ("road graph", 1)
+    assert (graph["content"], graph["dead_ends"]) == ("road graph", 4)
 
 
 @pytest.mark.parametrize("name", ["roads.html", "roads.png"])
@@ -87,13 +87,13 @@ def test_intermediate_stages_are_kept_on_request(folder, call):
     options = ("--keep-intermediate", "stages", "--resolution", "2", "-q")
     assert call("build", "drives.csv", *COLUMNS, *options, "-o", "coarse.gpkg") == (0, "", "")
     names = {path.name for path in (folder / "stages").iterdir()}
-    assert names >= {"1-probability.tif", "2-mask.tif", "3-skeleton.tif", "4-vectorized.gpkg", "5-cleaned.gpkg"}
+    assert names >= {"1-probability.tif", "2-mask.tif", "3-skeleton.tif", "4-vectorized.gpkg", "7-roads.gpkg"}
     assert "stages.png" in names
 
 
 def test_options_come_from_toml(folder, call):
     (folder / "build.toml").write_text("[density]\nbandwidth = 6\n[clean]\ndead_end = 400\n")
-    code, _, err = call("build", "drives.csv", *COLUMNS, "--config", "build.toml", "-o", "toml.gpkg")
+    code, _, err = call("build", "drives.csv", *COLUMNS, "--config", "build.toml", "-o", "toml.gpkg", "--no-refine")
     assert code == 0, err
     assert len(read_graph(folder / "toml.gpkg").edges) < 4
 

@@ -40,13 +40,27 @@ def crossing():
 
 
 def test_a_crossing_comes_out(crossing):
-    graph = build(crossing)
+    graph = build(crossing, BuildOptions(refine=False))
     check_graph(graph)
     assert sorted(graph.degrees()) == [1, 1, 1, 1, 4]
     reference = graph_from_lines([np.array(line) + ORIGIN for line in CROSS], crs=CRS)
     scores = evaluate(graph, reference, metrics=["geo"])
     assert scores["f1"].iloc[0] > 0.9
     assert graph.edges["score"].between(0.5, 1).all()
+
+
+def test_roads_that_nobody_turns_between_cross_without_a_node(crossing):
+    graph = build(crossing)
+    check_graph(graph)
+    assert sorted(graph.degrees()) == [1, 1, 1, 1]
+    assert graph.edges.geometry.iloc[0].crosses(graph.edges.geometry.iloc[1])
+
+
+def test_roads_that_drives_turn_between_meet():
+    turning = drives([(0, 400), (800, 400)], [(400, 0), (400, 800)], [(0, 400), (400, 400), (400, 800)])
+    graph = build(turning)
+    assert sorted(graph.degrees()) == [1, 1, 1, 1, 4]
+    assert len(graph.turns) >= 3
 
 
 def test_every_stage_is_kept_on_request(crossing, tmp_path):
@@ -56,13 +70,15 @@ def test_every_stage_is_kept_on_request(crossing, tmp_path):
     skeleton, _ = read_raster(tmp_path / "stages" / "3-skeleton.tif")
     assert grid.crs == crossing.crs
     assert 0 < skeleton.sum() < mask.sum() < (probability > 0).sum()
-    kept = read_graph(tmp_path / "stages" / "5-cleaned.gpkg")
+    kept = read_graph(tmp_path / "stages" / "7-roads.gpkg")
     assert kept.edges.geometry.geom_equals_exact(graph.edges.geometry, 1e-6).all()
-    assert len(read_graph(tmp_path / "stages" / "4-vectorized.gpkg").edges) >= len(kept.edges)
+    assert len(read_graph(tmp_path / "stages" / "4-vectorized.gpkg").edges) == 4
+    assert len(read_graph(tmp_path / "stages" / "5-cleaned.gpkg").edges) == 4
 
 
 def test_an_interrupted_run_goes_on_where_it_stopped(crossing, tmp_path, monkeypatch):
-    whole = build(crossing)
+    options = BuildOptions(density=DensityOptions(bandwidth=4.5))
+    whole = build(crossing, options)
     monkeypatch.setattr("probe2road.recipe._WINDOW", 256)
     windows = []
 
@@ -74,7 +90,6 @@ def test_an_interrupted_run_goes_on_where_it_stopped(crossing, tmp_path, monkeyp
         return density_probability(counts, grid, options)
 
     monkeypatch.setattr("probe2road.segmentation.density.density_probability", counting)
-    options = BuildOptions(density=DensityOptions(bandwidth=4.5))  # estimating one would predict, too
     with pytest.raises(KeyboardInterrupt):
         build(crossing, options, workspace=tmp_path / "work")
     assert len(list((tmp_path / "work").glob("window-*.npy"))) == 3
@@ -104,8 +119,7 @@ def test_a_folder_with_other_things_in_it_is_left_alone(crossing, tmp_path):
 def test_progress_is_reported_to_the_end(crossing):
     told = []
     build(crossing, progress=lambda *args: told.append(args))
-    assert {stage for stage, _, _ in told} == {"segmentation", "skeleton", "graph"}
-    assert told[-1] == ("graph", 1, 1)
+    assert [stage for stage, done, total in told if done == total] == ["segmentation", "graph", "matching"]
 
 
 def test_a_finer_grid_gives_the_same_roads(crossing):

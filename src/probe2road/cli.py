@@ -84,6 +84,7 @@ def build(
     work_crs: Annotated[
         str | None, typer.Option(help="Metric CRS to work in; chosen from the data without it.")
     ] = None,
+    refine: Annotated[bool, typer.Option(help="Let the traces fill gaps and split false junctions.")] = True,
     config: Annotated[Path | None, typer.Option(help="TOML file with build options.")] = None,
     keep_intermediate: Annotated[
         Path | None, typer.Option(help="Folder that keeps what every stage made, and a picture of it.")
@@ -104,6 +105,8 @@ def build(
             raise OutputError(f"folder {path.parent} does not exist", where=path, fix="create it first")
     options = load_options(config, BuildOptions) if config else BuildOptions()
     chosen: dict[str, Any] = {"segmenter": segmenter, "resolution": resolution}
+    if not refine:
+        chosen["refine"] = False
     options = replace(options, **{name: value for name, value in chosen.items() if value is not None})
 
     fleet = _read_fleet(traces, points, columns, point_columns, crs, bbox, delimiter, no_header, work_crs)

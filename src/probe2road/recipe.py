@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,22 +16,20 @@ from probe2road.fleet import Fleet, TraceGaps
 from probe2road.grid import Grid, read_raster
 from probe2road.picture import Stage, write_filmstrip
 from probe2road.raster import fleet_grid, rasterize, rasterize_windows
+from probe2road.refinement import RefineOptions, refine_graph
 from probe2road.roadgraph import RoadGraph
 from probe2road.segmentation.density import DensityOptions, density_segmenter
 from probe2road.segmentation.mask import threshold_mask
 from probe2road.segmentation.segmenter import Segmenter
 from probe2road.skeleton import skeletonize_windows
 from probe2road.vectorize import VectorizeOptions, vectorize
-from probe2road.workspace import Workspace, open_workspace
+from probe2road.workspace import Progress, Workspace, open_workspace
 
 __all__ = ["SEGMENTERS", "BuildOptions", "Progress", "build", "draw_stages"]
 
 logger = logging.getLogger(__name__)
 
 SEGMENTERS = ("density",)
-
-Progress = Callable[[str, int, int], None]
-"""Called with the stage, how much of it is done, and how much there is."""
 
 _WINDOW = 1024  # pixels; side of the windows that are rasterised and segmented one at a time
 
@@ -47,6 +44,8 @@ class BuildOptions:
     density: DensityOptions = field(default_factory=DensityOptions)  # of the density segmenter
     vectorize: VectorizeOptions = field(default_factory=VectorizeOptions)  # how pixels become lines
     clean: CleanOptions = field(default_factory=CleanOptions)  # what counts as a flaw
+    refine: bool = True  # whether the traces fill gaps, split false junctions and are counted
+    refinement: RefineOptions = field(default_factory=RefineOptions)  # how they do
 
     def __post_init__(self) -> None:
         """Refuse an unknown segmenter."""
@@ -64,8 +63,9 @@ def build(
     """Build a road graph from fleet data.
 
     Rasterises the fleet window by window, segments each into centreline probability, thresholds, thins to a
-    skeleton, traces it into a graph and cleans that. The result does not depend on the order of the traces or
-    on the direction they were driven. Memory follows the area that was driven, not its bounding box.
+    skeleton, traces it into a graph and cleans that; then matches the traces to the graph to fill its gaps, to
+    split its false junctions and to count what was driven. The result does not depend on the order of the
+    traces. Memory follows the area that was driven, not its bounding box.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def build(
 
     Notes
     -----
-    Paper, section III; the stages that need map matching are not part of it yet.
+    Paper, section III.
 
     Examples
     --------
@@ -106,7 +106,7 @@ def build(
     options, report = options or BuildOptions(), progress or _silent
     grid = fleet_grid(fleet, resolution=options.resolution)
     work = open_workspace(workspace, fleet, options)
-    if (graph := work.read_graph("5-cleaned")) is not None:
+    if (graph := work.read_graph("7-roads")) is not None:
         return graph
 
     probability, segmenter = _segment(fleet, grid, options, work, report)
@@ -121,6 +121,9 @@ def build(
     graph = clean_graph(graph, options.clean)
     work.write_graph("5-cleaned", graph)
     report("graph", 1, 1)
+    if options.refine:
+        graph = refine_graph(graph, fleet, options.refinement, clean=options.clean, work=work, report=report)
+    work.write_graph("7-roads", graph)
     return graph
 
 
@@ -176,7 +179,7 @@ def draw_stages(folder: str | Path, fleet: Fleet, path: str | Path) -> None:
         Stage("Probability", probability[0], grid, "of a centreline"),
         Stage("Skeleton", skeleton[0].astype(bool), grid, f"{int(skeleton.sum()):,} pixels"),
         Stage("Graph", read_graph(folder / "4-vectorized.gpkg")),
-        Stage("Cleaned graph", read_graph(folder / "5-cleaned.gpkg")),
+        Stage("Roads", read_graph(folder / "7-roads.gpkg")),
     ]
     write_filmstrip(panels, path)
 

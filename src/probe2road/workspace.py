@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,9 +29,12 @@ from probe2road.roadgraph import RoadGraph
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["Workspace", "fingerprint", "open_workspace"]
+__all__ = ["Progress", "Workspace", "fingerprint", "open_workspace"]
 
 logger = logging.getLogger(__name__)
+
+Progress = Callable[[str, int, int], None]
+"""Called with the stage, how much of it is done, and how much there is."""
 
 _MARK = "run.json"
 _FORMAT = 1  # raised when what a stage writes changes
