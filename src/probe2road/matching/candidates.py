@@ -119,7 +119,7 @@ def _sort(values: NDArray[np.int64], count: int) -> None:
         values[place] = value
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _project(states: States, p: int, x: float, y: float) -> tuple[float, float]:
     """Return the share of a piece at its point nearest to a place, and the squared distance to it."""
     to_x, to_y = x - states.x[p], y - states.y[p]
@@ -132,7 +132,7 @@ def _project(states: States, p: int, x: float, y: float) -> tuple[float, float]:
     return share, to_x * to_x + to_y * to_y
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def nearest_on_edge(states: States, edge: int, x: float, y: float, low: float, high: float) -> tuple[float, float]:
     """Return the point of an edge between two offsets from u that is nearest to a place, and its distance."""
     best_along, best = low, np.inf

@@ -124,7 +124,7 @@ def match_over_routes(
     )  # fmt: skip
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _place(paths: Paths, fix: int, step: int, along: float, distance: float) -> None:
     paths.step[fix], paths.along[fix], paths.distance[fix] = step, along, distance
 
@@ -165,7 +165,7 @@ def _follow_route(
     return number
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _driven_span(
     states: States, state: int, begin: float, end: float, is_first: bool, is_last: bool
 ) -> tuple[float, float]:

@@ -84,7 +84,7 @@ def search(
         _relax(follow, d, d, key + length, labels.driven[d] + length, beta, limit, labels, number, heap)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _relax(
     follow: Follow, d: int, before: int, key: float, driven: float, beta: float, limit: float,
     labels: Labels, number: int, heap: list[tuple[float, int]],

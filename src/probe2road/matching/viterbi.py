@@ -9,8 +9,8 @@ once for each direction, and "no road". Costs are negative log probabilities. Fr
 * a jump to any candidate costs ``break_cost``, leaving and entering the network half of it each.
 
 A jump is always possible, so the chain never breaks down, and it bounds the search: a route is only of use
-where it beats the best jump. The search from a candidate therefore ends where its own cost plus that of the
-route exceeds the cheapest jump. This prunes without approximation; most searches end within the edge.
+where it beats the best jump, now or at the next key fix. The search from a candidate therefore ends where its own
+cost plus that of the route is too high. This prunes without approximation.
 
 Ties go to the candidate that comes first: lower edge row, then driven from u to v. Memory for a trace is a few
 numbers for each candidate of its key fixes. All traces share nothing but the network.
@@ -221,50 +221,77 @@ def _advance(
     candidates: Candidates, parameters: Parameters, labels: Labels, number: int,
     floor: float, score: NDArray[np.float64], back: NDArray[np.int64],
 ) -> int:  # fmt: skip
-    """Improve the scores of the candidates of key k over routes from those of the key before."""
+    """Improve the scores of the candidates of key k over routes from those of the key before.
+
+    Sources are taken from the best on. A target is of no use any more where its score, its emission included,
+    exceeds that of the best target by a jump: from the next key on, the jump is at least as good. ``cap`` is the
+    score that a target must stay below, so the searches of the later sources are short.
+    """
     i, j = keys[k - 1], keys[k]
     straight = np.hypot(observed.x[j] - observed.x[i], observed.y[j] - observed.y[i])
     if straight > parameters.max_step:
         return number
     beta = parameters.beta + parameters.beta_rate * (observed.t[j] - observed.t[i])
-    low, high = candidates.first[k], candidates.first[k + 1]
-    for source in range(candidates.first[k - 1], low):
+    low, start = candidates.first[k], candidates.first[k - 1]
+    targets = np.arange(low, candidates.first[k + 1])
+    n_targets = len(targets)
+    lowest = (floor + candidates.cost[targets]).min() if n_targets else np.inf
+    for rank in np.argsort(score[start:low], kind="mergesort"):
+        source = start + rank
         base = score[source]
-        if base >= floor:
-            continue
         number += 1
         origin = candidates.state[source]
         rest = states.length[origin >> 1] - candidates.progress[source]
-        limit = straight + beta * (floor - base)
-        if rest <= limit:
-            n_wanted = 0
-            for c in range(low, high):
+        limit, n_wanted, kept = 0.0, 0, 0
+        for place in range(n_targets):
+            c = targets[place]
+            cap = min(score[c], lowest + parameters.break_cost - candidates.cost[c])
+            if cap <= base:
+                continue  # for good, because bases rise and caps fall
+            targets[kept] = c
+            kept += 1
+            if candidates.state[c] == origin:
+                cap = min(cap, base + _stay(candidates, source, c, straight, beta))
+            reach = straight + beta * (cap - base)
+            if rest + candidates.progress[c] <= reach:  # else no route over the end of the edge is short enough
+                limit = max(limit, reach - candidates.progress[c])
                 n_wanted += labels.wanted[candidates.state[c]] != number
                 labels.wanted[candidates.state[c]] = number
+        n_targets = kept
+        if n_targets == 0:
+            break
+        if n_wanted > 0:
             search(states, follow, origin, rest, beta, limit, labels, number, n_wanted)
-        for c in range(low, high):
+        for place in range(n_targets):
+            c = targets[place]
             cost = base + _route(candidates, source, c, straight, beta, labels, number)[0]
             if cost < score[c]:
                 score[c], back[c] = cost, source
+                lowest = min(lowest, cost + candidates.cost[c])
     return number
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _route(
     candidates: Candidates, source: int, target: int, straight: float, beta: float, labels: Labels, number: int
 ) -> tuple[float, bool]:
     """Return the cost of the route between two candidates, and whether it stays on their edge."""
-    cost, stays = np.inf, False
     d = candidates.state[target]
-    step = candidates.progress[target] - candidates.progress[source]
-    if d == candidates.state[source] and step >= -_BACKTRACK:
-        cost, stays = abs(step - straight) / beta, True
+    cost = _stay(candidates, source, target, straight, beta) if d == candidates.state[source] else np.inf
+    stays = cost < np.inf
     if labels.stamp[d] == number:
         length = labels.driven[d] + candidates.progress[target]
         around = (abs(length - straight) + labels.key[d] - labels.driven[d]) / beta
         if around < cost:
             cost, stays = around, False
     return cost, stays
+
+
+@njit(cache=True, inline="always")
+def _stay(candidates: Candidates, source: int, target: int, straight: float, beta: float) -> float:
+    """Return the cost of going between two candidates on one directed edge; noise may go back a little."""
+    step = candidates.progress[target] - candidates.progress[source]
+    return abs(step - straight) / beta if step >= -_BACKTRACK else np.inf
 
 
 @njit(cache=True)
@@ -279,9 +306,10 @@ def shortest(
     i, j = keys[k - 1], keys[k]
     straight = np.hypot(observed.x[j] - observed.x[i], observed.y[j] - observed.y[i])
     beta = parameters.beta + parameters.beta_rate * (observed.t[j] - observed.t[i])
-    limit = straight + beta * parameters.break_cost
-    number += 1
     origin, d = candidates.state[source], candidates.state[target]
+    cost = _stay(candidates, source, target, straight, beta) if d == origin else np.inf
+    limit = straight + beta * min(cost, parameters.break_cost) - candidates.progress[target] + 1e-3  # for rounding
+    number += 1
     labels.wanted[d] = number
     rest = states.length[origin >> 1] - candidates.progress[source]
     search(states, follow, origin, rest, beta, limit, labels, number, 1)
