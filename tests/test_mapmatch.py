@@ -11,6 +11,7 @@ import pytest
 import shapely
 from numpy.typing import NDArray
 
+from probe2road.crs import WGS84, local_crs, transform
 from probe2road.errors import CRSError, InputError, OptionError
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.mapmatch import Matches, MatchOptions, match, turn_counts
@@ -352,3 +353,23 @@ def test_options_come_from_tables_and_are_checked() -> None:
 DATA = (
     Path(os.environ.get("PROBE2ROAD_DATA", Path(__file__).parents[2] / "shared" / "data")) / "mapmatching" / "kubicka"
 )
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the Kubicka tracks are absent; set PROBE2ROAD_DATA")
+@pytest.mark.parametrize("interval", [1, 5, 15])
+def test_a_real_track_follows_its_true_route(interval: int) -> None:
+    folder = DATA / "00000045"  # 10 km, not among the tracks that parameters were chosen on
+    nodes, arcs, track, route = (
+        np.loadtxt(folder / f"{folder.name}.{kind}", ndmin=2) for kind in ("nodes", "arcs", "track", "route")
+    )
+    crs = local_crs(nodes[:, 0], nodes[:, 1])
+    xy = np.stack(transform(nodes[:, 0], nodes[:, 1], WGS84, crs), axis=1)
+    ends = np.unique(np.sort(arcs.astype(int), axis=1), axis=0)
+    graph = graph_from_lines(shapely.linestrings(xy[ends]), crs=crs, snap=0.0)
+    table = pd.DataFrame({"trace_id": 0, "t": track[:, 2], "x": track[:, 0], "y": track[:, 1]})[::interval]
+    found = match(fleet_from_tables(table, crs="EPSG:4326", target_crs=crs), graph)
+    numbers = {(int(u), int(v)): edge for edge, (u, v) in enumerate(ends)}
+    true = [numbers[min(u, v), max(u, v)] for u, v in arcs[route[:, 0].astype(int)].astype(int).tolist()]
+    wrong = set(true) ^ set(found.steps["edge"])
+    length = graph.edges["length"]
+    assert length[list(wrong)].sum() < 0.02 * length[true].sum()
