@@ -1,7 +1,7 @@
 """Junctions of every kind with a known number of drives for each movement: do these two edges connect here?
 
-Run with ``python benchmarks/junction_suite.py`` (about 10 minutes on one core; ``--density`` for whole builds,
-``--pictures FOLDER`` for drawings). The tables of docs/results/junctions.md are its output.
+Run with ``python benchmarks/junction_suite.py``; ``--builds`` scores whole builds from traces. The tables of
+docs/results/junctions.md are its output.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
+from probe2road.clean import clean_graph
 from probe2road.disambiguate import DisambiguateOptions, split_false_junctions
 from probe2road.fleet import Fleet
 from probe2road.fleet_tables import empty_points
 from probe2road.gaps import fill_gaps, gap_weights, prune_gaps
 from probe2road.mapmatch import Matches, match
 from probe2road.passages import passing_positions
-from probe2road.recipe import build
+from probe2road.recipe import BuildOptions, build
 from probe2road.roadgraph import RoadGraph, finish_edges
 from probe2road.simulate.crossings import find_crossings
 from probe2road.simulate.fleet_simulation import FleetWorld, fleet_world, simulate_drive
@@ -249,9 +250,9 @@ def score_builds(name: str, preset: str, counts: Iterable[int], *, seed: int) ->
     for k in counts:
         chosen = fleet.traces["trace_id"].map(repetition) < k
         some = replace(fleet, traces=fleet.traces[chosen].reset_index(drop=True))
-        built = build(some)
+        built = build(some, BuildOptions(refine=False))
         filled = fill_gaps(built)
-        joined = prune_gaps(filled, match(some, filled, edge_weights=gap_weights(filled)).steps)
+        joined = clean_graph(prune_gaps(filled, match(some, filled, edge_weights=gap_weights(filled)).steps))
         matches = match(some, joined)
         positions = passing_positions(some, matches, joined)
         graphs = {"segmentation": built}

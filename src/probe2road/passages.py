@@ -96,7 +96,7 @@ def places_around(graph: RoadGraph, inner: NDArray[np.int64]) -> Places:
 def passing_positions(fleet: Fleet, matches: Matches, graph: RoadGraph) -> pd.DataFrame:
     """Return where every trace was when it passed a node.
 
-    Positions are those of the traces themselves, interpolated in time between the fixes around the node. One trace is
+    Positions are those of the traces themselves, interpolated between the fixes around the node. One trace is
     metres off, most of all in height, and by nearly the same all along its drive: positions at one junction are to be
     compared between many traces, not believed one by one.
 
@@ -238,7 +238,7 @@ def _end_rows(graph: RoadGraph) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def _interpolated(
     fleet: Fleet, trace_id: pd.Series, moment: NDArray[np.datetime64], place: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Interpolate the positions of traces at moments, NaN where no fixes are near the places; shape (n, 3)."""
+    """Interpolate traces at places that they passed about some moments; NaN where no fixes are near; shape (n, 3)."""
     starts = fleet.starts
     names = pd.Index(fleet.traces["trace_id"].to_numpy()[starts[:-1]])
     trace = names.get_indexer(trace_id)
@@ -255,8 +255,10 @@ def _interpolated(
     result = np.full((len(moment), 3), np.nan)
     i, j = a[known].astype(np.int64), b[known].astype(np.int64)
     xyz = fleet.traces[["x", "y", "z"]].to_numpy(np.float64)
-    span = (clock[j] - clock[i]) / np.timedelta64(1, "s")
-    share = np.divide((moment[known] - clock[i]) / np.timedelta64(1, "s"), span, out=np.zeros(len(i)), where=span > 0)
+    # Between the two fixes around the moment, where the trace is nearest to the node.
+    ahead, to_node = xyz[j, :2] - xyz[i, :2], place[known] - xyz[i, :2]
+    square = (ahead**2).sum(axis=1)
+    share = np.divide((ahead * to_node).sum(axis=1), square, out=np.zeros(len(i)), where=square > 0).clip(0.0, 1.0)
     near = np.hypot(*(xyz[j, :2] - xyz[i, :2]).T) <= _FAR
     near &= np.hypot(*(xyz[i, :2] - place[known]).T) <= _FAR
     result[known] = np.where(near[:, None], xyz[i] + share[:, None] * (xyz[j] - xyz[i]), np.nan)
