@@ -2,9 +2,9 @@
 
 Usage: python benchmarks/centreline.py [--data ../shared/data] [--seed 11] [--only NAME]
 
-Graphs are built from simulated fleets with the defaults, matched and refined with the same fleet, and compared with the
-true centrelines; then the same on the real traces of Chicago against its references. The seeds are not those that the
-options were chosen with (1 to 3). The tables of docs/results/centreline.md are the output; about 10 minutes on one core.
+Graphs are built from simulated fleets with the defaults, matched and refined with the same fleet, and compared with
+the true centrelines; then the same on the real traces of Chicago against its references. The seeds are not those that
+the options were chosen with (1 to 3). The tables of docs/results/centreline.md are the output; 5 minutes on one core.
 """
 
 from __future__ import annotations

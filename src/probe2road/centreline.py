@@ -56,13 +56,13 @@ class CentrelineOptions:
     reach: float = 80.0  # m; wiggles of the shift that are shorter are levelled
     max_shift: float = 5.0  # m
     max_left: float = 20.0  # m; fixes farther aside do not vote
-    prior_sigma: float = 2.0  # m, by which the present course is expected to be off
+    prior_sigma: float = 4.0  # m, by which the present course is expected to be off
     vote_sigma: float = 1.5  # m, least spread of votes about the middle, lanes included
     min_traces: int = 3  # on an edge; with fewer it stays
     two_way_share: float = 0.1  # of the votes that the rarer direction has on a road driven both ways
     fade: float = 25.0  # m from a node, within which the shift changes from that of the node to that of the edge
     boundaries: bool = True  # whether road boundaries count, where the fleet has any
-    boundary_weight: float = 10.0  # votes that boundaries seen on both sides are worth
+    boundary_weight: float = 60.0  # votes that boundaries seen on both sides are worth
     tolerance: float = 0.1  # m, by which the result is simplified
 
     def __post_init__(self) -> None:

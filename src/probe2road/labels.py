@@ -1,0 +1,253 @@
+"""Labels: reference centrelines where enough traces drive them, and masks of these.
+
+A segmentation network cannot be asked for roads that its input does not show. The paper therefore keeps a reference
+centreline only where at least N = 4 traces were matched to it.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import shapely
+from numba import njit
+from numpy.typing import NDArray
+
+from probe2road.crs import same_crs
+from probe2road.edge_frame import frame
+from probe2road.errors import CRSError, OptionError
+from probe2road.fleet import Fleet
+from probe2road.grid import Grid
+from probe2road.mapmatch import MatchOptions, match
+from probe2road.osrm import OsrmOptions, osrm_network, osrm_segments, osrm_server
+from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
+from probe2road.splitting import split_edges
+
+__all__ = ["MATCHERS", "LabelOptions", "cut_reference", "label_mask", "label_reference"]
+
+logger = logging.getLogger(__name__)
+
+MATCHERS = ("own", "osrm")
+
+
+@dataclass(frozen=True)
+class LabelOptions:
+    """When a piece of a reference counts as driven (METHOD 5.2)."""
+
+    min_traces: int = 4  # distinct traces; the N of the paper
+    max_piece: float = 100.0  # m; longer edges are cut into equal pieces before counting, of half of this at least
+    min_share: float = 0.5  # of a piece that a trace has to cover
+    matcher: str = "own"  # one of MATCHERS
+    match: MatchOptions = field(default=MatchOptions())  # of our own matcher
+    osrm: OsrmOptions = field(default=OsrmOptions())
+    osrm_url: str | None = None  # of a server that runs on the graph that osrm_network makes of the cut reference
+    osrm_folder: Path | None = None  # where OSRM's programs are, if not where find_osrm looks
+
+    def __post_init__(self) -> None:
+        """Refuse unknown matchers and numbers out of range."""
+        if self.matcher not in MATCHERS:
+            fix = f"use {' or '.join(MATCHERS)}"
+            raise OptionError(f"matcher is {self.matcher!r}", where="LabelOptions", fix=fix)
+        limits = {"min_traces": self.min_traces >= 0, "max_piece": self.max_piece > 0}
+        limits["min_share"] = 0 < self.min_share <= 1
+        for entry in fields(self):
+            if not limits.get(entry.name, True):
+                fault = f"{entry.name} is {getattr(self, entry.name)}"
+                raise OptionError(fault, where="LabelOptions", fix="use a positive number, and a share of at most 1")
+
+
+def label_reference(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions | None = None) -> RoadGraph:
+    """Keep the pieces of a reference that enough traces of a fleet drive.
+
+    Parameters
+    ----------
+    reference
+        Centrelines, connected where one can drive from one to the other; one-way where the graph says so.
+    fleet
+        Traces in the same CRS.
+    options
+        The defaults where it is None.
+
+    Returns
+    -------
+    RoadGraph
+        The pieces, with ``support`` counted on this fleet; other attributes are those of their edges. The column
+        ``reference_edge`` says which these were. Nodes without an edge and turns are left out.
+
+    Raises
+    ------
+    CRSError
+        If reference and fleet are in different CRS.
+    MissingExtraError
+        If OSRM is asked for and not installed.
+    InputError
+        If the OSRM server cannot be reached.
+
+    Notes
+    -----
+    Paper, section III-A; METHOD 5.2 and 0.1 row 33.
+
+    Examples
+    --------
+    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> reference = graph_from_lines([[(0, 0), (240, 0)], [(240, 0), (240, 90)]], crs="EPSG:32616")
+    >>> there = pd.DataFrame({"t": range(15), "x": np.arange(5.0, 155, 10), "y": 1.0})
+    >>> drives = pd.concat([there.assign(trace_id=k) for k in range(4)])
+    >>> fleet = fleet_from_tables(drives, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> label_reference(reference, fleet).edges[["reference_edge", "length", "support"]].values.tolist()
+    [[0, 80.0, 4], [0, 80.0, 4]]
+    """
+    options = options or LabelOptions()
+    if not same_crs(fleet.crs, reference.crs):
+        fault = f"the traces are in {fleet.crs.name}, the reference is in {reference.crs.name}"
+        raise CRSError(fault, where="label_reference", fix="reproject one of them, for example with graph.to_crs")
+    pieces = cut_reference(reference, max_piece=options.max_piece)
+    ask = _covered_by_osrm if options.matcher == "osrm" else _covered_by_own
+    table = _joined(ask(pieces, fleet, options))
+    covered = table.groupby(["trace", "edge"])["length"].sum().reset_index()
+    length = pieces.edges["length"].to_numpy()
+    driven = covered[covered["length"].to_numpy() >= options.min_share * length[covered["edge"]]]
+    support = np.bincount(driven["edge"], minlength=len(length))
+    kept = support >= options.min_traces
+    edges = pieces.edges.assign(support=pd.array(support, "Int64"))[kept]
+    nodes = pieces.nodes[pieces.nodes.index.isin(np.unique(edges[["u", "v"]]))]
+    logger.info(
+        "kept %.1f of %.1f km: pieces that at least %d traces drive (%s)",
+        length[kept].sum() / 1000, length.sum() / 1000, options.min_traces, options.matcher,
+    )  # fmt: skip
+    return replace(pieces, nodes=nodes, edges=finish_edges(edges), turns=empty_turns())
+
+
+def cut_reference(reference: RoadGraph, *, max_piece: float = 100.0) -> RoadGraph:
+    """Cut edges that are longer than ``max_piece`` (m) into as few equal pieces as possible.
+
+    The pieces are therefore at least half as long. The column ``reference_edge`` holds the id of the edge that a
+    piece was cut from; the first piece keeps that id.
+
+    Examples
+    --------
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(0, 0), (210, 0)], [(210, 0), (210, 60)]], crs="EPSG:32616")
+    >>> cut_reference(graph).edges[["length", "reference_edge"]].values.tolist()
+    [[70.0, 0.0], [60.0, 1.0], [70.0, 0.0], [70.0, 0.0]]
+    """
+    named = replace(reference, edges=reference.edges.assign(reference_edge=reference.edges.index.to_numpy()))
+    length = reference.edges["length"].to_numpy()
+    count = np.maximum(np.ceil(length / max_piece - 1e-9), 1).astype(np.int64)
+    row = np.repeat(np.arange(len(length)), count - 1)
+    number = np.arange(len(row)) - np.repeat(np.cumsum(count - 1) - (count - 1), count - 1) + 1
+    along = number * (length / count)[row]
+    return split_edges(named, reference.edges.index.to_numpy()[row], along)[0]
+
+
+def label_mask(graph: RoadGraph, grid: Grid, *, width: int = 1) -> NDArray[np.uint8]:
+    """Draw the edges of a graph as lines: 1 on a line, 0 elsewhere.
+
+    Lines of width 1 are Bresenham's, one pixel wide and connected over edges and corners of pixels. Wider lines are
+    those dilated to a square of so many pixels (an even width reaches one pixel further up and left). What lies
+    outside the grid is left out.
+
+    Parameters
+    ----------
+    graph
+        In the CRS of the grid.
+    grid
+        Where to draw.
+    width
+        Pixels.
+
+    Returns
+    -------
+    ndarray of uint8, shape (rows, cols)
+
+    Raises
+    ------
+    CRSError
+        If graph and grid are in different CRS.
+    OptionError
+        If the width is below 1.
+
+    Examples
+    --------
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(900.5, 0.5), (902.5, 0.5), (904.5, 2.5)]], crs="EPSG:32616")
+    >>> label_mask(graph, Grid.from_bounds(graph.bounds, crs=graph.crs))
+    array([[0, 0, 0, 0, 1],
+           [0, 0, 0, 1, 0],
+           [1, 1, 1, 0, 0]], dtype=uint8)
+    """
+    if not same_crs(graph.crs, grid.crs):
+        fault = f"the graph is in {graph.crs.name}, the grid is in {grid.crs.name}"
+        raise CRSError(fault, where="label_mask", fix="use graph.to_crs")
+    if width < 1:
+        raise OptionError(f"width is {width}", where="label_mask", fix="use 1 pixel or more")
+    xy, owner = shapely.get_coordinates(graph.edges.geometry.to_numpy(), return_index=True)
+    row, col = grid.rowcol(xy[:, 0], xy[:, 1])
+    mask = np.zeros(grid.shape, np.uint8)
+    _draw(row, col, owner.astype(np.int64), width // 2, (width - 1) // 2, mask)
+    return mask
+
+
+def _covered_by_own(pieces: RoadGraph, fleet: Fleet, options: LabelOptions) -> pd.DataFrame:
+    """List the stretches that traces cover, by our own matcher: ``trace``, ``edge`` (row), ``low``, ``high`` (m)."""
+    driven, _ = frame(pieces, fleet, match(fleet, pieces, options.match))
+    return pd.DataFrame({"trace": driven.trace, "edge": driven.edge, "low": driven.low, "high": driven.high})
+
+
+def _covered_by_osrm(pieces: RoadGraph, fleet: Fleet, options: LabelOptions) -> pd.DataFrame:
+    """List the stretches that traces cover, by OSRM; columns as for our own."""
+    network = osrm_network(pieces, options.osrm)
+    if options.osrm_url is not None:
+        trace, segment = osrm_segments(fleet, network, options.osrm_url, options.osrm)
+    else:
+        with osrm_server(network, folder=options.osrm_folder) as url:
+            trace, segment = osrm_segments(fleet, network, url, options.osrm)
+    stretch = {"edge": network.edge[segment], "low": network.low[segment], "high": network.high[segment]}
+    return pd.DataFrame({"trace": trace, **stretch})
+
+
+def _joined(table: pd.DataFrame) -> pd.DataFrame:
+    """Shorten stretches of one trace on one edge so that none overlaps another; adds ``length``."""
+    table = table.sort_values(["trace", "edge", "low"], kind="stable")
+    reached = table.groupby(["trace", "edge"])["high"].cummax()
+    before = reached.groupby([table["trace"], table["edge"]]).shift(1).fillna(-np.inf)
+    return table.assign(length=(table["high"] - np.maximum(table["low"], before)).clip(lower=0.0))
+
+
+@njit(cache=True)
+def _draw(
+    row: NDArray[np.int64],
+    col: NDArray[np.int64],
+    owner: NDArray[np.int64],
+    before: int,
+    after: int,
+    mask: NDArray[np.uint8],
+) -> None:
+    """Set the pixels of Bresenham's lines between the vertices of each owner, and ``before``/``after`` around them.
+
+    Every line is drawn from its northern (then western) end, so that it does not matter which way an edge runs.
+    """
+    for k in range(1, len(row)):
+        if owner[k] != owner[k - 1]:
+            continue
+        a, b = k - 1, k
+        if row[a] > row[b] or (row[a] == row[b] and col[a] > col[b]):
+            a, b = b, a
+        r, c = row[a], col[a]
+        d_row, d_col = row[b] - row[a], abs(col[b] - col[a])
+        east = 1 if col[b] >= col[a] else -1
+        steps, minor = max(d_row, d_col), min(d_row, d_col)
+        error = steps // 2
+        for _ in range(steps + 1):
+            for i in range(max(r - before, 0), min(r + after + 1, mask.shape[0])):
+                for j in range(max(c - before, 0), min(c + after + 1, mask.shape[1])):
+                    mask[i, j] = 1
+            error -= minor
+            slip = error < 0
+            error += steps if slip else 0
+            r += 1 if d_row > d_col or slip else 0
+            c += east if d_row <= d_col or slip else 0
