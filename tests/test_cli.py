@@ -76,6 +76,16 @@ def test_info_tells_fleet_data_from_a_graph(built, call):
     assert (graph["content"], graph["dead_ends"]) == ("road graph", 4)
 
 
+def test_match_tells_the_edge_of_every_fix(folder, built, call):
+    words = ("drives.csv", "roads.gpkg", *COLUMNS, "-o", "matches.parquet", "--steps", "steps.parquet")
+    code, _, err = call("match", *words)
+    assert code == 0, err
+    matches, steps = (pd.read_parquet(folder / name) for name in ("matches.parquet", "steps.parquet"))
+    assert len(matches) == 12 * 40
+    assert matches["edge"].notna().mean() > 0.9
+    assert steps["trace_id"].nunique() == 12
+
+
 @pytest.mark.parametrize("name", ["roads.html", "roads.png"])
 def test_view_draws_a_page_or_a_picture(folder, built, call, name):
     code, _, err = call("view", "roads.gpkg", "--traces", "drives.csv", *COLUMNS, "-o", name)

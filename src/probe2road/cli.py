@@ -122,6 +122,40 @@ def build(
 
 
 @app.command()
+def match(
+    traces: Annotated[Path, typer.Argument(help="Fleet data: a file or a folder.")],
+    graph: Annotated[Path, typer.Argument(help="Road graph, in any format that build writes, or OSM.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file for the matches, a row for each fix.")],
+    steps: Annotated[Path | None, typer.Option(help="Parquet file for the paths, a row for each edge driven.")] = None,
+    profile: Annotated[str | None, typer.Option(help="auto, fleet, sparse or published.")] = None,
+    columns: Columns = None,
+    crs: Crs = None,
+    bbox: Bbox = None,
+    delimiter: Delimiter = None,
+    no_header: NoHeader = False,
+    config: Annotated[Path | None, typer.Option(help="TOML file with matching options.")] = None,
+) -> None:
+    """Match traces to the edges of a road graph."""
+    from probe2road.export import read_graph
+    from probe2road.io.atomic import atomic_path
+    from probe2road.mapmatch import MatchOptions
+    from probe2road.mapmatch import match as match_fleet
+    from probe2road.options import load_options
+
+    options = load_options(config, MatchOptions) if config else MatchOptions()
+    options = replace(options, profile=profile) if profile else options
+    roads = read_graph(graph)
+    work_crs = roads.crs.to_wkt()
+    fleet = _read_fleet([traces], None, columns, None, crs, bbox, delimiter, no_header, work_crs)
+    matches = match_fleet(fleet, roads, options)
+    for path, table in ((output, matches.fixes), (steps, matches.steps)):
+        if path is not None:
+            with atomic_path(path) as temporary:
+                table.to_parquet(temporary, index=False)
+            logger.info("wrote %d rows to %s", len(table), path)
+
+
+@app.command()
 def evaluate(
     proposal: Annotated[Path, typer.Argument(help="Road graph to score.")],
     reference: Annotated[Path, typer.Argument(help="Road graph to score against.")],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -32,7 +32,7 @@ def load_options(path: str | Path, kind: type[T]) -> T:
 
 
 def options_from_table(table: dict[str, Any], kind: type[T], *, where: object = None) -> T:
-    """Build a dataclass from a table of its fields; absent fields keep their defaults.
+    """Build a dataclass, all of whose fields have defaults, from a table of some of them.
 
     Raises
     ------
@@ -49,20 +49,25 @@ def options_from_table(table: dict[str, Any], kind: type[T], *, where: object = 
         ...
     probe2road.errors.OptionError: build.toml: there is no option 'deadend'; use short_edge, max_ring, ...
     """
-    hints = get_type_hints(kind)
-    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    return _replaced(kind(), table, where)
+
+
+def _replaced(defaults: Any, table: dict[str, Any], where: object) -> Any:
+    """Return a dataclass with the fields that a table sets; nested tables change nested defaults."""
+    hints = get_type_hints(type(defaults))
+    names = [field.name for field in fields(defaults)]
     values = {}
     for name, value in table.items():
         if name not in names:
             raise OptionError(f"there is no option {name!r}", where=where, fix=f"use {', '.join(names)}")
-        values[name] = _converted(value, hints[name], f"{where}: {name}" if where else name)
-    return kind(**values)
+        default, place = getattr(defaults, name), f"{where}: {name}" if where else name
+        nested = is_dataclass(default) and isinstance(value, dict)
+        values[name] = _replaced(default, value, place) if nested else _converted(value, hints[name], place)
+    return replace(defaults, **values)
 
 
 def _converted(value: Any, hint: Any, where: str) -> Any:
-    """Return the value as its field wants it: tables become dataclasses, whole numbers become floats."""
-    if is_dataclass(hint) and isinstance(value, dict):
-        return options_from_table(value, hint, where=where)  # type: ignore[arg-type]
+    """Return the value as its field wants it: whole numbers become floats."""
     allowed = get_args(hint) or (hint,)
     if float in allowed and type(value) is int:
         return float(value)
