@@ -31,6 +31,7 @@ __all__ = ["GapOptions", "fill_gaps", "gap_weights", "prune_gaps"]
 logger = logging.getLogger(__name__)
 
 _ALONG = 45.0  # degrees; an edge beside a dead end runs along it when the two directions differ by less
+_TURN = 45.0  # degrees that count like the distance once more
 _LEAD = 2.0  # times the distance aside, by which a link to an edge beside leads ahead: it leaves by about 27 degrees
 _NEW_NODE = 5.0  # m; links that hit an edge within this of each other share a node
 _TOUCH = 0.05  # m; a link is not tested for crossings nearer than this to its ends
@@ -243,14 +244,14 @@ def _dead_ends(graph: RoadGraph, lines: NDArray[np.object_], reach: float) -> _D
 def _to_dead_ends(ends: _DeadEnds, options: GapOptions) -> _Links:
     """Link every dead end to the nearest one that lies ahead of it and that it lies ahead of.
 
-    A turn counts like a detour, a right angle like the distance once more: where two interrupted roads cross, their
+    A turn counts like a detour, each 45 degrees like the distance once more: where two interrupted roads cross, their
     four ends are joined across and not around the corner.
     """
     pairs = KDTree(ends.position).query_pairs(options.max_length, output_type="ndarray") if len(ends.edge) else []
     one, other = np.concatenate([pairs, np.flip(pairs, 1)]).T if len(pairs) else np.zeros((2, 0), np.int64)
     vector = ends.position[other] - ends.position[one]
     turns = np.stack([_angle(ends.ahead[one], vector), _angle(-ends.ahead[other], vector)])
-    distance = np.hypot(*vector.T) * (1.0 + turns.sum(axis=0) / 90.0)
+    distance = np.hypot(*vector.T) * (1.0 + turns.sum(axis=0) / _TURN)
     fits = (turns.max(axis=0) <= options.max_turn) & (distance > 0)
     one, other, distance = one[fits], other[fits], distance[fits]
     order = np.lexsort([*ends.position[other].T, distance.round(6), one])
@@ -287,13 +288,18 @@ def _to_edges_beside(
     A ramp's end is nearly parallel to the mainline. Its straight extension would reach it far ahead, or never.
     """
     end, edge = tree.query(shapely.points(ends.position), predicate="dwithin", distance=options.beside)
-    aside = shapely.distance(shapely.points(ends.position[end]), lines[edge])
+    nearest = shapely.line_interpolate_point(
+        lines[edge], shapely.line_locate_point(lines[edge], shapely.points(ends.position[end]))
+    )
+    to_edge = shapely.get_coordinates(nearest).reshape(-1, 2) - ends.position[end]
+    aside = np.hypot(*to_edge.T)
     ahead = shapely.points(ends.position[end] + _LEAD * aside[:, None] * ends.ahead[end])
     along = shapely.line_locate_point(lines[edge], ahead)
     target = shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], along))
     slope = _angle(ends.ahead[end], _directions(lines[edge], along))
     kept = (
         (aside > _TOUCH)
+        & (_angle(ends.ahead[end], to_edge) >= _ALONG)  # else it is ahead, not beside
         & (np.minimum(slope, 180.0 - slope) <= _ALONG)
         & (_angle(ends.ahead[end], target - ends.position[end]) <= _ALONG)
         & _apart_on_edge(lines, ends, end, edge, along, options.max_length)
