@@ -58,8 +58,8 @@ VARIANTS: Mapping[str, tuple[DisambiguateOptions | None, bool]] = {
     "none": (None, False),
     "literal": (replace(OFF, variant="literal"), False),
     "guarded": (OFF, False),
-    "guarded, artefacts": (replace(OFF, max_inner=40.0), False),
-    "with altitude": (replace(OFF, max_inner=40.0), True),
+    "guarded, artefacts": (replace(OFF, max_inner=DisambiguateOptions().max_inner), False),
+    "with altitude": (replace(OFF, max_inner=DisambiguateOptions().max_inner), True),
 }
 COUNTS = (0, 1, 2, 4, 8, 50, 200)
 

@@ -40,7 +40,7 @@ class DisambiguateOptions:
     variant: str = "guarded"  # one of VARIANTS
     min_count: int = 4  # passages from which two edge ends are connected (METHOD 0.1 row 23)
     min_share: float = 0.05  # of the less driven end's passages that a pair must have; below are matching errors
-    max_inner: float = 40.0  # m; shorter edges between two junctions may be artefacts of a crossing; 0 trusts all
+    max_inner: float = 60.0  # m; shorter edges between two junctions may be artefacts of a crossing; 0 trusts all
     min_apart: float = 3.0  # m between the traces of two roads at both nodes of an artefact; on one road they coincide
     min_height: float = 4.0  # m between traces on stacked roads
     confidence: float = 2.0  # standard errors by which a height difference must differ from none
