@@ -141,6 +141,7 @@ class TestShape:
         assert filled.edges["support"].tolist()[:3] == [7, 3, 7]
         assert filled.edges["name"].tolist()[:3] == ["A", "B", "A"]
         assert filled.edges.geometry[0].coords[-1] == (50, 0, 15)
+        assert list(filled.edges.geometry[3].coords) == [(50, -20, 0), (50, 0, 15)]
 
     def test_turns_follow_the_parts(self) -> None:
         graph = graph_of([(0, 0), (100, 0)], [(100, 0), (150, 40)], [(50, -90), (50, -20)])

@@ -2,27 +2,35 @@
 
 Strategy
 --------
-All dead ends are looked at together and on the graph as it came. Each proposes at most three links: to a dead end, to
-what its straight extension hits, and to an edge that runs beside it. A link is a row: the end it starts from, and a
-target, which is a node or a place on an edge. Links that cross an edge are dropped. What is left is taken from the
-shortest link to the longest, as long as it does not repeat one that was taken. Lengths and then coordinates order the
-links, so the order of the edges plays no part.
+Each dead end proposes at most three links (`probe2road.gap_links`). Those that cross an edge are dropped. What is left
+is taken from the shortest link to the longest, as long as it does not repeat one that was taken.
 """
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import geopandas as gpd
 import numpy as np
 import pandas as pd
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from probe2road.clean import merge_degree_two_nodes
 from probe2road.errors import OptionError
+from probe2road.gap_links import (
+    NO_NODE,
+    DeadEnds,
+    GapOptions,
+    Links,
+    crosses,
+    dead_ends,
+    straight_on,
+    to_dead_ends,
+    to_edges_beside,
+    within_reach,
+)
 from probe2road.roadgraph import RoadGraph, finish_edges
 from probe2road.splitting import split_edges
 
@@ -30,61 +38,7 @@ __all__ = ["GapOptions", "fill_gaps", "gap_weights", "prune_gaps"]
 
 logger = logging.getLogger(__name__)
 
-_ALONG = 45.0  # degrees; an edge beside a dead end runs along it when the two directions differ by less
-_TURN = 45.0  # degrees that count like the distance once more
-_LEAD = 2.0  # times the distance aside, by which a link to an edge beside leads ahead: it leaves by about 27 degrees
 _NEW_NODE = 5.0  # m; links that hit an edge within this of each other share a node
-_TOUCH = 0.05  # m; a link is not tested for crossings nearer than this to its ends
-_NO_NODE = -1
-
-
-@dataclass(frozen=True)
-class GapOptions:
-    """Which gaps are filled (METHOD 3.6, 0.1 rows 16 to 18)."""
-
-    max_length: float = 50.0  # m; longer links are never made
-    snap: float = 15.0  # m; a hit this near to the end of its edge goes to the node there
-    beside: float = 20.0  # m; a dead end is led into an edge that runs along it this near; 0 switches that off
-    max_turn: float = 90.0  # degrees, between road and link, at both ends of a link between dead ends
-    min_angle: float = 20.0  # degrees; of two links at one node that differ by less, the shorter is made
-    heading_length: float = 15.0  # m, over which the direction of a dead end is measured
-    max_links: int = 2  # links at one node
-
-    def __post_init__(self) -> None:
-        """Refuse negative numbers."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not value >= 0:
-                fix = "use a number that is not negative"
-                raise OptionError(f"{field.name} is {value}", where="GapOptions", fix=fix)
-        if not self.heading_length > 0:
-            raise OptionError("heading_length is 0", where="GapOptions", fix="use a positive number")
-
-
-@dataclass(frozen=True)
-class _DeadEnds:
-    """n dead ends."""
-
-    edge: NDArray[np.int64]  # (n,) row of the edge
-    node: NDArray[np.int64]  # (n,) row of the node
-    at_start: NDArray[np.bool_]  # (n,) whether the edge starts here
-    position: NDArray[np.float64]  # (n, 2) m
-    ahead: NDArray[np.float64]  # (n, 2) unit vector out of the road
-
-
-@dataclass(frozen=True)
-class _Links:
-    """n links from dead ends."""
-
-    end: NDArray[np.int64]  # (n,) row of the dead end
-    node: NDArray[np.int64]  # (n,) row of the node it leads to, _NO_NODE where it leads into an edge
-    edge: NDArray[np.int64]  # (n,) row of the edge it leads to, also where it was snapped to one of its nodes
-    along: NDArray[np.float64]  # (n,) m from the start of that edge
-    target: NDArray[np.float64]  # (n, 2) m
-
-    def where(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> _Links:
-        """Return some of the links."""
-        return _Links(*(getattr(self, field.name)[kept] for field in fields(self)))
 
 
 def fill_gaps(graph: RoadGraph, *, options: GapOptions | None = None) -> RoadGraph:
@@ -134,16 +88,16 @@ def fill_gaps(graph: RoadGraph, *, options: GapOptions | None = None) -> RoadGra
     if not len(graph.edges):
         return graph
     lines = shapely.force_2d(graph.edges.geometry.to_numpy())
-    ends = _dead_ends(graph, lines, options.heading_length)
+    ends = dead_ends(graph, lines, options.heading_length)
     tree = shapely.STRtree(lines)
     proposed = [
-        _to_dead_ends(ends, options),
-        _straight_on(graph, lines, tree, ends, options),
-        _to_edges_beside(graph, lines, tree, ends, options),
+        to_dead_ends(ends, options),
+        straight_on(graph, lines, tree, ends, options),
+        to_edges_beside(graph, lines, tree, ends, options),
     ]
-    links = _Links(*(np.concatenate([getattr(part, field.name) for part in proposed]) for field in fields(_Links)))
-    links = _within_reach(ends, links, options)
-    links = links.where(~_crosses(graph, tree, ends, links))
+    links = Links(*(np.concatenate([getattr(part, field.name) for part in proposed]) for field in fields(Links)))
+    links = within_reach(ends, links, options)
+    links = links.where(~crosses(graph, tree, ends, links))
     links = _chosen(ends, links, options)
     logger.info("added %d gap edges from %d dead ends", len(links.end), len(ends.edge))
     return _with_links(graph, ends, links) if len(links.end) else graph
@@ -223,160 +177,7 @@ def prune_gaps(graph: RoadGraph, steps: pd.DataFrame, *, min_traces: int = 4) ->
     return merge_degree_two_nodes(graph)
 
 
-def _dead_ends(graph: RoadGraph, lines: NDArray[np.object_], reach: float) -> _DeadEnds:
-    """Collect the ends of edges at nodes of degree 1."""
-    row = pd.Series(np.arange(len(graph.nodes)), index=graph.nodes.index)
-    node = np.stack([row[graph.edges[end]].to_numpy() for end in ("u", "v")])
-    degree = np.bincount(node.ravel(), minlength=len(graph.nodes))
-    side, edge = np.nonzero(degree[node] == 1)
-    at_start = side == 0
-    length = shapely.length(lines[edge])
-    position = shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], np.where(at_start, 0.0, length)))
-    inner = np.where(at_start, np.minimum(reach, length), np.maximum(length - reach, 0.0))
-    ahead = position - shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], inner))
-    # An edge that curls back onto its end within the reach has no direction; it is left out.
-    norm = np.hypot(*ahead.T)
-    kept = norm > 0
-    ahead = ahead[kept] / norm[kept, None]
-    return _DeadEnds(edge[kept], node[side, edge][kept], at_start[kept], position[kept], ahead)
-
-
-def _to_dead_ends(ends: _DeadEnds, options: GapOptions) -> _Links:
-    """Link every dead end to the nearest one that lies ahead of it and that it lies ahead of.
-
-    A turn counts like a detour, each 45 degrees like the distance once more: where two interrupted roads cross, their
-    four ends are joined across and not around the corner.
-    """
-    pairs = KDTree(ends.position).query_pairs(options.max_length, output_type="ndarray") if len(ends.edge) else []
-    one, other = np.concatenate([pairs, np.flip(pairs, 1)]).T if len(pairs) else np.zeros((2, 0), np.int64)
-    vector = ends.position[other] - ends.position[one]
-    turns = np.stack([_angle(ends.ahead[one], vector), _angle(-ends.ahead[other], vector)])
-    distance = np.hypot(*vector.T) * (1.0 + turns.sum(axis=0) / _TURN)
-    fits = (turns.max(axis=0) <= options.max_turn) & (distance > 0)
-    one, other, distance = one[fits], other[fits], distance[fits]
-    order = np.lexsort([*ends.position[other].T, distance.round(6), one])
-    nearest = order[_heads(one[order])]
-    one, other = one[nearest], other[nearest]
-    unknown = np.full(len(one), -1)
-    return _Links(one, ends.node[other], unknown, np.full(len(one), np.nan), ends.position[other])
-
-
-def _straight_on(
-    graph: RoadGraph, lines: NDArray[np.object_], tree: shapely.STRtree, ends: _DeadEnds, options: GapOptions
-) -> _Links:
-    """Link every dead end to what its straight extension hits first."""
-    far = ends.position + options.max_length * ends.ahead
-    rays = shapely.linestrings(np.stack([ends.position, far], axis=1))
-    end, edge = tree.query(rays, predicate="intersects")
-    hits = shapely.intersection(rays[end], lines[edge])
-    places, pair = shapely.get_coordinates(hits, return_index=True)  # of a stretch in common, both ends
-    end, edge = end[pair], edge[pair]
-    distance = ((places - ends.position[end]) * ends.ahead[end]).sum(axis=1)
-    along = shapely.line_locate_point(lines[edge], shapely.points(places))
-    kept = (distance > _TOUCH) & _apart_on_edge(lines, ends, end, edge, along, options.max_length)
-    order = np.flatnonzero(kept)
-    order = order[np.lexsort([along[order], distance[order], end[order]])]
-    first = order[_heads(end[order])]
-    return _snapped(graph, lines, end[first], edge[first], along[first], options.snap)
-
-
-def _to_edges_beside(
-    graph: RoadGraph, lines: NDArray[np.object_], tree: shapely.STRtree, ends: _DeadEnds, options: GapOptions
-) -> _Links:
-    """Link every dead end to the nearest edge that runs along it, ahead by twice the distance between them.
-
-    A ramp's end is nearly parallel to the mainline. Its straight extension would reach it far ahead, or never.
-    """
-    end, edge = tree.query(shapely.points(ends.position), predicate="dwithin", distance=options.beside)
-    nearest = shapely.line_interpolate_point(
-        lines[edge], shapely.line_locate_point(lines[edge], shapely.points(ends.position[end]))
-    )
-    to_edge = shapely.get_coordinates(nearest).reshape(-1, 2) - ends.position[end]
-    aside = np.hypot(*to_edge.T)
-    ahead = shapely.points(ends.position[end] + _LEAD * aside[:, None] * ends.ahead[end])
-    along = shapely.line_locate_point(lines[edge], ahead)
-    target = shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], along))
-    slope = _angle(ends.ahead[end], _directions(lines[edge], along))
-    kept = (
-        (aside > _TOUCH)
-        & (_angle(ends.ahead[end], to_edge) >= _ALONG)  # else it is ahead, not beside
-        & (np.minimum(slope, 180.0 - slope) <= _ALONG)
-        & (_angle(ends.ahead[end], target - ends.position[end]) <= _ALONG)
-        & _apart_on_edge(lines, ends, end, edge, along, options.max_length)
-    )
-    order = np.flatnonzero(kept)
-    order = order[np.lexsort([*target[order].T, aside[order], end[order]])]
-    nearest = order[_heads(end[order])]
-    return _snapped(graph, lines, end[nearest], edge[nearest], along[nearest], options.snap)
-
-
-def _apart_on_edge(
-    lines: NDArray[np.object_],
-    ends: _DeadEnds,
-    end: NDArray[np.int64],
-    edge: NDArray[np.int64],
-    along: NDArray[np.float64],
-    least: float,
-) -> NDArray[np.bool_]:
-    """Tell which places are on another edge than the dead end itself, or far from it along its own."""
-    own = ends.edge[end] == edge
-    from_end = np.where(ends.at_start[end], along, shapely.length(lines[edge]) - along)
-    return np.asarray(~own | (from_end > 2 * least))
-
-
-def _snapped(
-    graph: RoadGraph,
-    lines: NDArray[np.object_],
-    end: NDArray[np.int64],
-    edge: NDArray[np.int64],
-    along: NDArray[np.float64],
-    snap: float,
-) -> _Links:
-    """Lead links to places on edges, or to the nearer end node of an edge within ``snap``."""
-    length = shapely.length(lines[edge])
-    at_start = along <= length - along
-    snapped = np.minimum(along, length - along) <= snap
-    name = graph.edges[["u", "v"]].to_numpy()[edge, np.where(at_start, 0, 1)]
-    node = np.where(snapped, graph.nodes.index.get_indexer(name), _NO_NODE)
-    along = np.where(snapped, np.where(at_start, 0.0, length), along)
-    target = shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], along)).reshape(-1, 2)
-    return _Links(end, node, edge, along, target)
-
-
-def _within_reach(ends: _DeadEnds, links: _Links, options: GapOptions) -> _Links:
-    """Drop links that are too long, turn too sharply, or lead nowhere."""
-    vector = links.target - ends.position[links.end]
-    length = np.hypot(*vector.T)
-    turn = _angle(ends.ahead[links.end], vector)
-    # A link into a dead end turns there too, by whatever rule it came about.
-    of_node = pd.Series(np.arange(len(ends.node)), index=ends.node).groupby(level=0).first()
-    other = of_node.reindex(links.node).to_numpy(np.float64)
-    into = np.isfinite(other)
-    turn[into] = np.maximum(turn[into], _angle(-ends.ahead[other[into].astype(np.int64)], vector[into]))
-    elsewhere = (links.node != ends.node[links.end]) & (length > 0)
-    return links.where(elsewhere & (length <= options.max_length) & (turn <= options.max_turn))
-
-
-def _crosses(graph: RoadGraph, tree: shapely.STRtree, ends: _DeadEnds, links: _Links) -> NDArray[np.bool_]:
-    """Tell which links meet an edge between their ends; edges at the node that they lead to are not asked."""
-    start = ends.position[links.end]
-    vector = links.target - start
-    length = np.maximum(np.hypot(*vector.T), 2 * _TOUCH)[:, None]
-    body = shapely.linestrings(
-        np.stack([start + vector * (_TOUCH / length), links.target - vector * (_TOUCH / length)], axis=1)
-    )
-    link, edge = tree.query(body, predicate="intersects")
-    name = graph.nodes.index.to_numpy()
-    at_target = (graph.edges[["u", "v"]].to_numpy()[edge] == name[links.node[link]][:, None]).any(axis=1)
-    asked = ~(at_target & (links.node[link] != _NO_NODE)) & ~(
-        (links.node[link] == _NO_NODE) & (links.edge[link] == edge)
-    )
-    crosses = np.zeros(len(links.end), bool)
-    crosses[link[asked]] = True
-    return crosses
-
-
-def _chosen(ends: _DeadEnds, links: _Links, options: GapOptions) -> _Links:
+def _chosen(ends: DeadEnds, links: Links, options: GapOptions) -> Links:
     """Choose links from the shortest on, none like another at its node and not too many at a node."""
     vector = links.target - ends.position[links.end]
     order = np.lexsort([*links.target.T, *ends.position[links.end].T, np.hypot(*vector.T).round(6)])
@@ -385,7 +186,7 @@ def _chosen(ends: _DeadEnds, links: _Links, options: GapOptions) -> _Links:
     for link in order:
         bearing = float(np.degrees(np.arctan2(vector[link, 1], vector[link, 0])))
         away, towards = ("node", int(ends.node[links.end[link]]), 0), ("node", int(links.node[link]), 0)
-        if links.node[link] == _NO_NODE:
+        if links.node[link] == NO_NODE:
             towards = ("edge", int(links.edge[link]), round(links.along[link] / _NEW_NODE))
         here, there = at.setdefault(away, []), at.setdefault(towards, [])
         if _has_room(here, bearing, options) and _has_room(there, bearing + 180.0, options):
@@ -401,17 +202,16 @@ def _has_room(bearings: list[float], bearing: float, options: GapOptions) -> boo
     return not near and len(bearings) < options.max_links
 
 
-def _with_links(graph: RoadGraph, ends: _DeadEnds, links: _Links) -> RoadGraph:
+def _with_links(graph: RoadGraph, ends: DeadEnds, links: Links) -> RoadGraph:
     """Split edges where links lead into them, and add the links as edges."""
-    into = links.node == _NO_NODE
+    into = links.node == NO_NODE
     edge_ids = graph.edges.index.to_numpy()
     graph, made = split_edges(graph, edge_ids[links.edge[into]], links.along[into], merge=_NEW_NODE)
     names = graph.nodes.index.to_numpy()  # the old nodes come first, in their order
     u = names[ends.node[links.end]]
     v = names[links.node]
     v[into] = made
-    place = graph.nodes.geometry
-    lines = shapely.shortest_line(place[u].to_numpy(), place[v].to_numpy())
+    lines = _straight_lines(graph, u, v)
     first = int(graph.edges.index.max()) + 1
     new = gpd.GeoDataFrame(
         {"u": u, "v": v, "origin": "gap"},
@@ -423,19 +223,14 @@ def _with_links(graph: RoadGraph, ends: _DeadEnds, links: _Links) -> RoadGraph:
     return replace(graph, edges=finish_edges(edges))
 
 
-def _directions(lines: NDArray[np.object_], along: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return vectors along lines, over 2 m around places on them, shape (n, 2)."""
-    before = shapely.line_interpolate_point(lines, np.maximum(along - 1.0, 0.0))
-    after = shapely.line_interpolate_point(lines, np.minimum(along + 1.0, shapely.length(lines)))
-    return np.asarray(shapely.get_coordinates(after) - shapely.get_coordinates(before))
-
-
-def _angle(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angle between vectors of shape (n, 2), degrees from 0 to 180."""
-    cross = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
-    return np.asarray(np.degrees(np.arctan2(np.abs(cross), (one * other).sum(axis=1))))
-
-
-def _heads(group: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mark the first row of every group in a sorted array."""
-    return np.diff(group, prepend=-1) != 0
+def _straight_lines(graph: RoadGraph, u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.object_]:
+    """Draw lines between nodes, with the heights that edges have there where edges have heights."""
+    edges = graph.edges
+    lines = edges.geometry.to_numpy()
+    if shapely.has_z(lines).any():
+        ends = shapely.get_point(np.stack([lines, lines]), np.array([[0], [-1]])).ravel()
+        of_node = pd.Series(ends, index=np.concatenate([edges["u"], edges["v"]])).groupby(level=0).first()
+    else:
+        of_node = graph.nodes.geometry
+    xyz = [shapely.get_coordinates(of_node[node].to_numpy(), include_z=shapely.has_z(lines).any()) for node in (u, v)]
+    return np.asarray(shapely.linestrings(np.stack(xyz, axis=1)))

@@ -65,7 +65,9 @@ def split_edges(
     first = int(graph.nodes.index.max()) + 1
     cuts["node"] = 0
     cuts.iloc[order, cuts.columns.get_loc("node")] = np.arange(first, first + len(cuts))
-    new = gpd.GeoDataFrame(geometry=shapely.force_2d(points[order]), index=np.arange(first, first + len(cuts)))
+    if not shapely.has_z(graph.nodes.geometry.to_numpy()).any():
+        points = shapely.force_2d(points)
+    new = gpd.GeoDataFrame(geometry=points[order], index=np.arange(first, first + len(cuts)))
     nodes = pd.concat([graph.nodes, new.set_crs(graph.crs)]).rename_axis("node")
     made = cuts["node"].to_numpy()[places["cut"].sort_index().to_numpy()]
     return _with_parts(replace(graph, nodes=nodes), cuts), made
