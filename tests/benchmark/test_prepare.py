@@ -1,14 +1,20 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import pytest
 
 from probe2road.benchmark import datasets
+from probe2road.benchmark import prepare as module
 from probe2road.benchmark.datasets import DATASETS, GROUPS, find_dataset, find_datasets, load_network
 from probe2road.benchmark.prepare import check_dataset, prepare, prepare_dataset, read_tiles
+from probe2road.benchmark.recording import Recording
 from probe2road.benchmark.reference import MAIN_ROADS, labelled_reference
+from probe2road.benchmark.tiles import split_tiles
 from probe2road.errors import InputError, OptionError
 from probe2road.export import read_graph
 from probe2road.roadgraph import check_graph
@@ -20,10 +26,18 @@ ROADS = """<osm version="0.6">
 SPLITS = {"train": 6, "validation": 4, "test": 4}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_attempts():
+    """Draw blocks of tiles less often than the real sets do."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "split_tiles", partial(split_tiles, attempts=50))
+        yield
+
+
 @pytest.fixture(scope="module")
 def tiny():
     """A data set of a road of 20 km, and of few drives."""
-    return replace(find_dataset("columbus"), name="tiny", network="roads.osm", drive_km=50.0, splits=SPLITS)
+    return replace(find_dataset("columbus"), name="tiny", network="roads.osm", drive_km=25.0, splits=SPLITS)
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +88,9 @@ def test_labels_need_numbers_of_drives(fork):
         labelled_reference(fork.reference_graph())
 
 
-def test_damage_is_found(made, tiny, tmp_path):
-    (tmp_path / "roads.osm").write_text(ROADS)
-    copy = prepare_dataset(replace(tiny, drive_km=20.0), tmp_path / "copy", data=tmp_path)
+def test_damage_is_found(made, tmp_path):
+    copy = Recording(Path(shutil.copytree(made.folder, tmp_path / "copy")))
+    check_dataset(copy.folder)
     copy.poses.unlink()
     copy.routes.write_bytes(b"")
     with pytest.raises(InputError, match=r"2 faults(?s:.*)poses.parquet is missing(?s:.*)routes.parquet is not as"):

@@ -141,6 +141,7 @@ def test_other_roads_are_another_run(recorded, monkeypatch):
     assert len(read_graph(recorded.reference).edges) == 1
 
 
+@pytest.mark.slow  # two processes start
 def test_workers_change_nothing(fork, recorded, tmp_path):
     shared = record_fleet(fork, tmp_path / "shared", n_drives=8, seed=4, residual=ALIGNED, workers=2)
     assert contents(shared) == contents(recorded)

@@ -15,9 +15,9 @@ MODEL = ResidualModel()
 
 @pytest.fixture(scope="module")
 def made():
-    """Sixty drives along 12 km of straight road that runs north-east."""
-    network = network_from_sections([[(0, 0), (8500, 8500)]], crs="EPSG:32616", lanes_forward=2)
-    return simulate(network, n_drives=60, seed=5)
+    """Thirty drives along 8 km of straight road that runs north-east."""
+    network = network_from_sections([[(0, 0), (5700, 5700)]], crs="EPSG:32616", lanes_forward=2)
+    return simulate(network, n_drives=30, seed=5)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_aligned_points_lie_closer_together_than_raw_ones(made, aligned):
 
 def test_aligned_data_is_fleet_data(made, aligned):
     fleet = fleet_from_tables(*aligned, crs="EPSG:32616")
-    assert fleet.n_traces == 60
+    assert fleet.n_traces == 30
     assert set(aligned[0]["accuracy"]) == {round(MODEL.accuracy, 2)}
 
 

@@ -3,7 +3,7 @@
 Strategy: validation and test tiles are compact blocks of neighbours. Around each block every tile of another split
 is left out, so that at least one whole tile lies between any two splits. The blocks are drawn many times over; of
 the draws that leave enough tiles for training, the one is taken whose blocks resemble the whole most in how much
-motorway and how much ramp a tile holds.
+motorway, how much ramp and how many crossings a tile holds.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import geopandas as gpd
 import numpy as np
 import pandas as pd
 import shapely
+from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OptionError
 from probe2road.simulate.network import RoadNetwork
@@ -24,7 +25,7 @@ SPLITS = ("train", "validation", "test")
 TILE_SIZE = 1000.0  # m
 
 _SAMPLE = 5.0  # m; a road is assigned to tiles in pieces of this length
-_BLOCK = 4  # tiles that are drawn together
+_BLOCK = 6  # tiles that are drawn together; larger blocks have fewer tiles around them that are lost
 
 _Tile = tuple[int, int]
 
@@ -45,8 +46,8 @@ def motorway_tiles(network: RoadNetwork, *, size: float = TILE_SIZE) -> gpd.GeoD
     -------
     GeoDataFrame
         Index ``tile`` (``"column_row"``, counted from the origin of the CRS), ``column``, ``row``, ``motorway`` and
-        ``ramp`` (m of carriageway, to the nearest 5 m for each section), ``geometry`` (the square); ordered by
-        column and row.
+        ``ramp`` (m of carriageway, to the nearest 5 m for each section), ``crossings`` (places where any two roads
+        cross without meeting), ``geometry`` (the square); ordered by column and row.
 
     Examples
     --------
@@ -67,6 +68,9 @@ def motorway_tiles(network: RoadNetwork, *, size: float = TILE_SIZE) -> gpd.GeoD
     table["kind"] = np.where(sections["highway"].to_numpy()[owner] == "motorway", "motorway", "ramp")
     tiles = table.pivot_table("length", ["column", "row"], "kind", "sum", fill_value=0.0).reset_index()
     tiles = tiles.reindex(columns=["column", "row", "motorway", "ramp"], fill_value=0.0).rename_axis(columns=None)
+    crossing = np.floor(_crossings(network) / size).astype(np.int64)
+    counted = pd.Series(list(map(tuple, crossing.tolist())), dtype=object).value_counts()
+    tiles["crossings"] = [int(counted.get(place, 0)) for place in zip(tiles["column"], tiles["row"], strict=True)]
     left, bottom = (tiles[["column", "row"]].to_numpy(np.float64) * size).T
     tiles.index = pd.Index([f"{c}_{r}" for c, r in zip(tiles["column"], tiles["row"], strict=True)], name="tile")
     squares = shapely.box(left, bottom, left + size, bottom + size)
@@ -74,7 +78,7 @@ def motorway_tiles(network: RoadNetwork, *, size: float = TILE_SIZE) -> gpd.GeoD
 
 
 def split_tiles(
-    tiles: gpd.GeoDataFrame, counts: Mapping[str, int], *, rng: np.random.Generator, attempts: int = 2000
+    tiles: gpd.GeoDataFrame, counts: Mapping[str, int], *, rng: np.random.Generator, attempts: int = 20_000
 ) -> gpd.GeoDataFrame:
     """Choose tiles for training, validation and test so that no two splits touch.
 
@@ -105,7 +109,8 @@ def split_tiles(
     >>> from probe2road.simulate.network import network_from_sections
     >>> network = network_from_sections([[(0, 20), (20000, 20)]], crs="EPSG:32616")
     >>> counts = {"train": 6, "validation": 4, "test": 4}
-    >>> split = split_tiles(motorway_tiles(network), counts, rng=np.random.default_rng(1))["split"]
+    >>> rng = np.random.default_rng(1)
+    >>> split = split_tiles(motorway_tiles(network), counts, rng=rng, attempts=100)["split"]
     >>> split.value_counts().to_dict() == {**counts, "": 6}
     True
     """
@@ -113,7 +118,8 @@ def split_tiles(
         raise OptionError(f"splits are {', '.join(counts)}", where="split_tiles", fix=f"give {', '.join(SPLITS)}")
     places = list(zip(tiles["column"].tolist(), tiles["row"].tolist(), strict=True))
     road = (tiles["motorway"] + tiles["ramp"]).to_numpy()
-    features = np.log1p(tiles[["motorway", "ramp"]].to_numpy(np.float64) / 100.0)
+    features = tiles[["motorway", "ramp", "crossings"]].to_numpy(np.float64)
+    features = features / np.maximum(features.mean(axis=0), 1e-9)
     row_of = {place: row for row, place in enumerate(places)}
     best, least = None, np.inf
     for _ in range(attempts):
@@ -169,6 +175,16 @@ def split_area(tiles: gpd.GeoDataFrame, split: str, *, inset: float = 0.0) -> sh
     if area.is_empty:
         raise InputError(f"there is no area of split {split!r}", where="tiles", fix=f"use one of {', '.join(SPLITS)}")
     return area
+
+
+def _crossings(network: RoadNetwork) -> NDArray[np.float64]:
+    """Places where two sections cross in plan without a common node: shape ``(n, 2)``, m."""
+    lines = network.sections.geometry.to_numpy()
+    ends = network.sections[["u", "v"]].to_numpy()
+    i, j = shapely.STRtree(lines).query(lines, predicate="crosses")
+    apart = (i < j) & ~(ends[i][:, :, None] == ends[j][:, None, :]).any(axis=(1, 2))
+    points = shapely.get_parts(shapely.intersection(lines[i[apart]], lines[j[apart]]))
+    return shapely.get_coordinates(shapely.centroid(points)).reshape(-1, 2)
 
 
 def _draw(
