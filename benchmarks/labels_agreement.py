@@ -54,7 +54,9 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|---|")
     for name in [arguments.only] if arguments.only else DRIVES:
         network = network_of(name, arguments.data, arguments.seed)
-        for preset in PRESETS if network is not None else ():
+        if network is None:
+            continue
+        for preset in PRESETS:
             result = simulate(network, preset=preset, n_drives=DRIVES[name], seed=arguments.seed)
             for directed in (True, False):
                 compare(

@@ -60,6 +60,7 @@ class CentrelineOptions:
     vote_sigma: float = 1.5  # m, least spread of votes about the middle, lanes included
     min_traces: int = 3  # on an edge; with fewer it stays
     two_way_share: float = 0.1  # of the votes that the rarer direction has on a road driven both ways
+    max_gap: float = 6.0  # m between the two directions; an edge whose traffic is farther apart is two roads, and stays
     fade: float = 25.0  # m from a node, within which the shift changes from that of the node to that of the edge
     boundaries: bool = True  # whether road boundaries count, where the fleet has any
     boundary_weight: float = 60.0  # votes that boundaries seen on both sides are worth
@@ -172,6 +173,7 @@ def _offsets(
     medians = pd.Series(left).groupby(of_way).median()
     middle[medians.index.to_numpy()] = medians.to_numpy()
     half = np.where(both, (middle[1::2] - middle[0::2]) / 2, 0.0)  # of the way from the backward to the forward traffic
+    apart = both & (np.abs(middle[1::2] - middle[0::2]) > options.max_gap)
     # A few votes against the traffic of a one-way road are wrong matches.
     common = both[edge] | (forward == (count[edge, 1] >= count[edge, 0]))
     centred = (left - np.where(forward, half[edge], -half[edge]))[common]
@@ -181,6 +183,7 @@ def _offsets(
     weight[found.index.to_numpy()] = found["count"].to_numpy()
     spread = robust_sigma(centred, edge[common], n_edges)
     spread = np.maximum(np.nan_to_num(spread, nan=options.vote_sigma), options.vote_sigma)
+    weight[apart[stations.edge]] = 0.0
     return offset, weight * (options.vote_sigma / spread[stations.edge]) ** 2
 
 
@@ -301,7 +304,7 @@ def _planned(
     np.add.at(matrix, at, (wish + pull)[:, None, None] * n[:, :, None] * n[:, None, :])
     np.add.at(right, at, ((wish + pull) * want)[:, None] * n)
     matrix += pull * np.eye(2)
-    of_node = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
+    of_node = np.asarray(np.linalg.solve(matrix, right[:, :, None])[:, :, 0], np.float64)
     size = np.hypot(*of_node.T)
     of_node *= np.minimum(1.0, options.max_shift / np.maximum(size, 1e-9))[:, None]
 

@@ -375,7 +375,8 @@ def _heights_without_bias(
         off = value - bias[of] - height[at]
         sigma = max(options.height_sigma, _SIGMA_OF_MAD * float(np.median(np.abs(off))))
         weight = 1.0 / (1.0 + (off / (3.0 * sigma)) ** 2)
-    return height, z - bias[stretch] - height[place], np.bincount(at, weight, n_places)
+    left_over: NDArray[np.float64] = z - bias[stretch] - height[place]
+    return height, left_over, np.bincount(at, weight, n_places).astype(np.float64)
 
 
 def _joined_at_nodes(
