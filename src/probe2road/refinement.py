@@ -7,14 +7,16 @@ tell which junctions are real, and to say how often every edge and every turn wa
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
+from probe2road.centreline import CentrelineOptions, refine_centreline
 from probe2road.clean import CleanOptions, clean_graph
 from probe2road.disambiguate import DisambiguateOptions, split_false_junctions
 from probe2road.errors import OptionError
+from probe2road.evidence import EvidenceOptions, add_evidence
 from probe2road.fleet import Fleet
 from probe2road.gaps import GapOptions, fill_gaps, gap_weights, prune_gaps
-from probe2road.mapmatch import MatchOptions, match, turn_counts
+from probe2road.mapmatch import MatchOptions, match
 from probe2road.passages import passing_positions
 from probe2road.roadgraph import RoadGraph
 from probe2road.workspace import Progress, Workspace
@@ -31,6 +33,9 @@ class RefineOptions:
     gaps: GapOptions = field(default_factory=GapOptions)  # which gaps are filled
     matching: MatchOptions = field(default_factory=MatchOptions)  # how traces are matched
     junctions: DisambiguateOptions = field(default_factory=DisambiguateOptions)  # which junctions are split
+    evidence: EvidenceOptions = field(default_factory=EvidenceOptions)  # what counts as having driven an edge
+    move: bool = True  # whether edges move to the middle of what was driven
+    centreline: CentrelineOptions = field(default_factory=CentrelineOptions)  # how far they may
 
     def __post_init__(self) -> None:
         """Refuse a gap weight that would make gaps as good as roads."""
@@ -95,6 +100,9 @@ def refine_graph(
     graph = split_false_junctions(graph, matches.steps, positions=positions, options=options.junctions)
 
     report("matching", 2, 3)
-    graph = replace(graph, turns=turn_counts(match(fleet, graph, options.matching), graph))
+    matches = match(fleet, graph, options.matching)
+    graph = add_evidence(graph, fleet, matches, options=options.evidence)
+    if options.move:
+        graph = refine_centreline(graph, fleet, matches, options=options.centreline)
     report("matching", 3, 3)
     return graph
