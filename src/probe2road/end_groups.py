@@ -99,7 +99,7 @@ def connected_ends(found: Evidence, *, min_count: int) -> NDArray[np.int64]:
     The literal reading of the paper: a place without such a pair is a group of its own.
     """
     pairs = found.pairs[found.pairs["count"] >= min_count]
-    return _components(pairs, len(found.places.end))
+    return _components(pairs["one"].to_numpy(), pairs["other"].to_numpy(), len(found.places.end))
 
 
 def proven_groups(found: Evidence, directions: EndDirections, rules: GroupingRules) -> NDArray[np.int64]:
@@ -113,7 +113,7 @@ def proven_groups(found: Evidence, directions: EndDirections, rules: GroupingRul
     flow = np.bincount(one, count, m) + np.bincount(other, count, m)
     joined = (one != other) & (count >= rules.min_count)
     joined &= count >= rules.min_share * np.minimum(flow[one], flow[other])
-    label = _components(pairs[joined], m)
+    label = _components(one[joined], other[joined], m)
     proven = np.zeros(m, bool)
     proven[one[joined]] = proven[other[joined]] = True
 
@@ -121,10 +121,13 @@ def proven_groups(found: Evidence, directions: EndDirections, rules: GroupingRul
     owner = np.repeat(np.arange(len(head)), np.diff(np.append(head, m)))
     n_proven = pd.DataFrame({"owner": owner, "label": label})[proven].drop_duplicates()["owner"]
     asked = np.bincount(n_proven, minlength=len(head)) >= 2
+    light = (one != other) & ~proven[one] & ~proven[other]
+    light_label = _components(one[light], other[light], m)
     if len(found.heights):
-        light = (one != other) & ~proven[one] & ~proven[other]
         asked[owner[one[light]]] = True
     group = head[owner]
+    bounds = np.searchsorted(found.heights["pair"].to_numpy(), np.arange(len(pairs) + 1))
+    z = found.heights["z"].to_numpy()
     by_junction = pairs.assign(pair=np.arange(len(pairs))).groupby(owner[one]).indices
     for junction in np.flatnonzero(asked):
         stop = head[junction + 1] if junction + 1 < len(head) else m
@@ -134,9 +137,10 @@ def proven_groups(found: Evidence, directions: EndDirections, rules: GroupingRul
             direction=directions.ahead[places.end[here]],
             position=directions.position[places.end[here]],
             label=np.where(proven[here], label[here], -1),
+            light=np.where(proven[here], -1, light_label[here]),
             counts=_count_matrix(one[rows] - here.start, other[rows] - here.start, count[rows], here.stop - here.start),
             ends=np.stack([one[rows], other[rows]], axis=1) - here.start,
-            heights=[_heights_of(found.heights, row) for row in rows],
+            heights=[z[bounds[row] : bounds[row + 1]] for row in rows],
             spread=found.spread,
         )
         group[here] = here.start + _parted(local, rules)
@@ -150,6 +154,7 @@ class _Junction:
     direction: NDArray[np.float64]  # (k, 2) unit vectors into the edges
     position: NDArray[np.float64]  # (k, 2) m
     label: NDArray[np.int64]  # (k,) group by connected pairs, -1 for ends without one
+    light: NDArray[np.int64]  # (k,) group of the ends without one, by any passage between two such; -1 for all others
     counts: NDArray[np.int64]  # (k, k) passages, symmetric
     ends: NDArray[np.int64]  # (p, 2)
     heights: list[NDArray[np.float64]]  # p arrays, m
@@ -179,11 +184,8 @@ def _parted(junction: _Junction, rules: GroupingRules) -> NDArray[np.int64]:
 
 
 def _light_groups(junction: _Junction) -> list[NDArray[np.int64]]:
-    """Group the ends without a connected pair by any passage between them; the most driven first."""
-    free = junction.label < 0
-    links = np.argwhere((junction.counts > 0) & free[:, None] & free[None, :])
-    label = _components(pd.DataFrame(links, columns=["one", "other"]), len(free))
-    groups = [np.flatnonzero((label == name) & free) for name in np.unique(label[free])]
+    """Return the groups of ends without a connected pair that some traces passed between; the most driven first."""
+    groups = [np.flatnonzero(junction.light == name) for name in np.unique(junction.light[junction.light >= 0])]
     groups = [group for group in groups if len(group) > 1]
     return sorted(groups, key=lambda group: -int(junction.counts[np.ix_(group, group)].sum()))
 
@@ -193,13 +195,16 @@ def _without_level_crossings(
 ) -> list[NDArray[np.int64]]:
     """Unite groups that cross each other at one level: a crossing where nobody was seen to turn."""
     n = len(groups)
+    if n < 2:
+        return groups
     links = [
         (i, j)
         for i in range(n)
         for j in range(i + 1, n)
         if _level(junction, groups[i], groups[j], rules) and _interleaved(junction, groups[i], groups[j])
     ]
-    label = _components(pd.DataFrame(links, columns=["one", "other"], dtype=np.int64), n)
+    one, other = np.array(links, np.int64).reshape(-1, 2).T
+    label = _components(one, other, n)
     return [np.concatenate([groups[i] for i in np.flatnonzero(label == name)]) for name in np.unique(label)]
 
 
@@ -242,9 +247,8 @@ def _closest_group(junction: _Junction, end: int, groups: list[NDArray[np.int64]
     return max(range(len(groups)), key=lambda number: (counts[number], straight[number]))
 
 
-def _components(pairs: pd.DataFrame, n: int) -> NDArray[np.int64]:
-    """Return the connected component of each of n things that pairs ``one``, ``other`` join."""
-    one, other = pairs["one"].to_numpy(np.int64), pairs["other"].to_numpy(np.int64)
+def _components(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """Return the connected component of each of n things that pairs join."""
     matrix = coo_array((np.ones(len(one), bool), (one, other)), shape=(n, n))
     return connected_components(matrix, directed=False)[1].astype(np.int64) if n else np.zeros(0, np.int64)
 
@@ -255,12 +259,6 @@ def _count_matrix(
     matrix = np.zeros((k, k), np.int64)
     matrix[one, other] = matrix[other, one] = count
     return matrix
-
-
-def _heights_of(heights: pd.DataFrame, pair: int) -> NDArray[np.float64]:
-    """Heights of the traces of one pair."""
-    first, last = np.searchsorted(heights["pair"].to_numpy(), [pair, pair + 1])
-    return heights["z"].to_numpy()[first:last]
 
 
 def _spread(heights: pd.DataFrame) -> float:
