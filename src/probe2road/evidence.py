@@ -62,7 +62,7 @@ class EvidenceOptions:
     drive_pause: float = 300.0  # s; traces of one vehicle that follow each other sooner are one drive
     min_confidence: float = 0.9  # probability from which oneway gets a value
     wrong_way: float = 0.02  # share of traversals of a one-way road that are matched the wrong way
-    imbalance: float = 3.0  # a of Beta(a, a), the law of the share of one direction on two-way roads
+    imbalance: float = 2.0  # a of Beta(a, a), the law of the share of one direction on two-way roads
     oneway_share: float = 0.5  # of edges that are one-way, before anything was counted
     max_interval: float = 60.0  # s; longer intervals between fixes do not count for the speed
     station_spacing: float = 10.0  # m between the places at which heights are estimated
@@ -216,7 +216,7 @@ def oneway_probabilities(
     Examples
     --------
     >>> oneway_probabilities(np.array([0.0, 9, 9]), np.array([0.0, 0, 4])).round(2).tolist()
-    [[0.25, 0.25, 0.5], [0.94, 0.0, 0.06], [0.01, 0.0, 0.99]]
+    [[0.25, 0.25, 0.5], [0.9, 0.0, 0.1], [0.01, 0.0, 0.99]]
     """
     options = options or EvidenceOptions()
     wrong = 1.0 / options.wrong_way - 1.0  # b of Beta(1, b), whose mean is the share
