@@ -2,7 +2,7 @@
 
 Usage: python benchmarks/centreline.py [--data ../shared/data] [--seed 11] [--only NAME]
 
-Graphs are built from simulated fleets with the defaults, matched and refined with the same fleet, and compared with
+Graphs are built from simulated fleets with all stages but this one, then moved by the same fleet, and compared with
 the true centrelines; then the same on the real traces of Chicago against its references. The seeds are not those that
 the options were chosen with (1 to 3). The tables of docs/results/centreline.md are the output; 5 minutes on one core.
 """
@@ -25,6 +25,8 @@ from probe2road.centreline import CentrelineOptions, refine_centreline
 from probe2road.edge_frame import edge_lines, stations_along
 from probe2road.fleet import Fleet
 from probe2road.mapmatch import match
+from probe2road.recipe import BuildOptions
+from probe2road.refinement import RefineOptions
 from probe2road.roadgraph import RoadGraph
 from probe2road.simulate.fleet_simulation import simulate
 from probe2road.simulate.generate import generate_interchange, generate_town
@@ -33,6 +35,7 @@ from probe2road.simulate.osm import read_network
 
 CASES = ("cloverleaf", "diamond", "trumpet", "regular town", "irregular town", "tokyo_shibuya")
 PRESETS = ("mixed", "phone")
+UNMOVED = BuildOptions(refinement=RefineOptions(move=False))
 
 _STEP = 5.0  # m between the places at which the error is measured
 _FAR = 15.0  # m; what is farther from every true road running that way is a wrong road, not a wrong place
@@ -73,7 +76,7 @@ def network_of(case: str, data: Path, seed: int) -> RoadNetwork | None:
 def simulated(case: str, network: RoadNetwork, preset: str, seed: int) -> None:
     """Build and refine one graph and print its row."""
     result = simulate(network, preset=preset, n_drives=_DRIVES.get(case, 300), seed=seed)
-    graph = build(result.fleet)
+    graph = build(result.fleet, UNMOVED)
     matches = match(result.fleet, graph)
     refined = refine_centreline(graph, result.fleet, matches)
     alone = refine_centreline(graph, result.fleet, matches, options=CentrelineOptions(boundaries=False))
@@ -109,7 +112,7 @@ def chicago(folder: Path) -> None:
         print(f"\n{folder} is not there")
         return
     fleet: Fleet = read_fleet(folder / "traces.csv.gz", columns={"trace_id": "trip"}, crs="EPSG:32616")
-    graph = build(fleet)
+    graph = build(fleet, UNMOVED)
     start = process_time()
     matches = match(fleet, graph)
     middle = process_time()

@@ -17,7 +17,7 @@ from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.grid import Grid
 from probe2road.labels import LabelOptions, cut_reference, label_mask, label_reference
 from probe2road.osrm import OsrmOptions, find_osrm, osrm_network, osrm_segments, osrm_server
-from probe2road.roadgraph import RoadGraph, check_graph, graph_from_lines
+from probe2road.roadgraph import RoadGraph, check_graph, empty_graph, graph_from_lines
 from probe2road.simulate.fleet_simulation import simulate
 from probe2road.simulate.generate import generate_interchange
 
@@ -163,6 +163,13 @@ def test_missing_osrm_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tee: R
     monkeypatch.setenv("PROBE2ROAD_OSRM", "/nowhere")
     with pytest.raises(InputError, match="osrm-routed"):
         find_osrm()
+
+
+@pytest.mark.parametrize("matcher", ["own", "osrm"])
+def test_empty_reference_has_no_labels(matcher: str) -> None:
+    labels = label_reference(empty_graph(CRS), fleet(road((0, 0), (200, 0))), options=LabelOptions(matcher=matcher))
+    assert labels.edges.empty
+    assert label_mask(labels, Grid.from_bounds((0, 0, 9, 9), crs=CRS)).sum() == 0
 
 
 def test_server_that_is_not_there(tee: RoadGraph) -> None:

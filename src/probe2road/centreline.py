@@ -202,7 +202,7 @@ def _between_boundaries(
     """
     n = len(stations.edge)
     points = fleet.points[(fleet.points["kind"] == "road_boundary").to_numpy()]
-    poses = fleet.traces.iloc[fixes.row][["trace_id", "t"]].assign(traversal=fixes.traversal)
+    poses = fleet.traces.iloc[fixes.row][["trace_id", "t"]].assign(traversal=fixes.traversal).dropna(subset="t")
     seen = points[["trace_id", "t", "x", "y"]].merge(poses.drop_duplicates(["trace_id", "t"]), on=["trace_id", "t"])
     if seen.empty:
         return np.full(n, np.nan), np.zeros(n)

@@ -200,6 +200,8 @@ def _covered_by_own(pieces: RoadGraph, fleet: Fleet, options: LabelOptions) -> p
 
 def _covered_by_osrm(pieces: RoadGraph, fleet: Fleet, options: LabelOptions) -> pd.DataFrame:
     """List the stretches that traces cover, by OSRM; columns as for our own."""
+    if not len(pieces.edges):  # OSRM refuses to make a network of nothing
+        return pd.DataFrame({name: np.zeros(0, np.int64) for name in ("trace", "edge", "low", "high")})
     network = osrm_network(pieces, options.osrm)
     if options.osrm_url is not None:
         trace, segment = osrm_segments(fleet, network, options.osrm_url, options.osrm)
