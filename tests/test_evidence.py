@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,6 +15,7 @@ from probe2road.errors import CRSError, InputError, OptionError, OutputError
 from probe2road.evidence import EVIDENCE_COLUMNS, EvidenceOptions, add_evidence, drive_numbers, oneway_probabilities
 from probe2road.export import read_graph, write_graph
 from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.heights import HeightOptions
 from probe2road.mapmatch import match
 from probe2road.roadgraph import RoadGraph, check_graph, driving_direction, graph_from_lines
 from probe2road.simulate.fleet_simulation import simulate
@@ -38,7 +40,7 @@ def fleet(*drives: pd.DataFrame) -> Fleet:
     return fleet_from_tables(pd.concat(drives, ignore_index=True), crs=CRS, target_crs=CRS)
 
 
-def known(graph: RoadGraph, data: Fleet, **options: float) -> RoadGraph:
+def known(graph: RoadGraph, data: Fleet, **options: Any) -> RoadGraph:
     return add_evidence(graph, data, match(data, graph), options=EvidenceOptions(**options))
 
 
@@ -129,7 +131,7 @@ def test_profile_of_a_bridge_from_traces_with_biases() -> None:
         table = drive((0, 0), (1000, 0), name=k)
         noise = rng.normal(0, 3.0) + rng.normal(0, 0.2, len(table))
         drives.append(table.assign(z=height(table["x"].to_numpy()) + noise))
-    found = known(graph, fleet(*drives), height_reach=50.0)
+    found = known(graph, fleet(*drives), heights=HeightOptions(reach=50.0))
     place = edge_lines(found)
     x = np.linspace(0, 1000, 101)
     z = place.at(np.zeros(101, np.int64), x)[0][:, 2]
@@ -203,10 +205,12 @@ def test_wrong_matches_and_crs_are_refused(tee: RoadGraph) -> None:
         add_evidence(tee.to_crs("EPSG:32617"), data, found)
 
 
-@pytest.mark.parametrize("wrong", [{"min_cover": -1.0}, {"wrong_way": 0.0}, {"height_sigma": 0.0}])
+@pytest.mark.parametrize("wrong", [{"min_cover": -1.0}, {"wrong_way": 0.0}])
 def test_options_out_of_range(wrong: dict[str, float]) -> None:
     with pytest.raises(OptionError, match=next(iter(wrong))):
         EvidenceOptions(**wrong)
+    with pytest.raises(OptionError, match="sigma is 0"):
+        HeightOptions(sigma=0.0)
 
 
 def test_a_trace_lost_on_an_edge_traversed_it_once(tee: RoadGraph) -> None:

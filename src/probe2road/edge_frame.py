@@ -12,6 +12,7 @@ Legend of array shapes: E edges, P vertices, T traversals, n matched fixes, S st
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -219,25 +220,11 @@ def frame(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[Traversals,
     >>> driven.low.tolist(), driven.high.tolist(), fixes.left.tolist()
     ([40.0, 0.0], [100.0, 40.0], [2.0, 1.0, -1.0])
     """
-    steps, table = matches.steps, matches.fixes
+    starts, table = fleet.starts, matches.fixes
     if len(table) != len(fleet.traces):
         fault = f"the matches are of {len(table)} fixes, the fleet has {len(fleet.traces)}"
         raise InputError(fault, where="frame", fix="pass the fleet that was matched")
-    edge = graph.edges.index.get_indexer(steps["edge"]).astype(np.int64)
-    if (edge < 0).any():
-        fault = f"edge {steps['edge'].to_numpy()[edge < 0][0]} of the matches is not in the graph"
-        raise InputError(fault, where="frame", fix="pass the graph that was matched on")
-    starts, forward = fleet.starts, steps["forward"].to_numpy(bool)
-    names = pd.Index(fleet.traces["trace_id"].to_numpy()[starts[:-1]])
-    trace = names.get_indexer(steps["trace_id"]).astype(np.int64)
-    entered, left = steps["entered"].to_numpy(bool), steps["left"].to_numpy(bool)
-
-    again = np.zeros(len(edge), bool)
-    again[1:] = ~entered[1:] & (trace[1:] == trace[:-1]) & (edge[1:] == edge[:-1]) & (forward[1:] == forward[:-1])
-    head = np.flatnonzero(~again)
-    tail = np.append(head[1:], len(edge)) - 1 if len(head) else head
-    trace, edge, forward, entered, left = trace[head], edge[head], forward[head], entered[head], left[tail]
-
+    trace, edge, forward, entered, left = _steps(graph, fleet, matches)
     row = np.flatnonzero(table["edge"].notna().to_numpy())
     of_fix = graph.edges.index.get_indexer(table["edge"].to_numpy(np.int64, na_value=-1)[row]).astype(np.int64)
     way = table["forward"].to_numpy(bool, na_value=False)[row]
@@ -252,6 +239,23 @@ def frame(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[Traversals,
     fixes = FramedFixes(row, traversal, along, direction[:, 0] * away[:, 1] - direction[:, 1] * away[:, 0])
     low, high = _covered(fixes, lines.length[edge], forward, entered, left)
     return Traversals(trace, edge, forward, low, high), fixes
+
+
+def _steps(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[NDArray[Any], ...]:
+    """Return trace, edge, forward, entered and left of every traversal, shape (T,): steps, those of one drive as one."""
+    steps = matches.steps
+    edge = graph.edges.index.get_indexer(steps["edge"]).astype(np.int64)
+    if (edge < 0).any():
+        fault = f"edge {steps['edge'].to_numpy()[edge < 0][0]} of the matches is not in the graph"
+        raise InputError(fault, where="frame", fix="pass the graph that was matched on")
+    names = pd.Index(fleet.traces["trace_id"].to_numpy()[fleet.starts[:-1]])
+    trace = names.get_indexer(steps["trace_id"]).astype(np.int64)
+    forward, entered, left = (steps[name].to_numpy(bool) for name in ("forward", "entered", "left"))
+    again = np.zeros(len(edge), bool)
+    again[1:] = ~entered[1:] & (trace[1:] == trace[:-1]) & (edge[1:] == edge[:-1]) & (forward[1:] == forward[:-1])
+    head = np.flatnonzero(~again)
+    tail = np.append(head[1:], len(edge)) - 1 if len(head) else head
+    return trace[head], edge[head], forward[head], entered[head], left[tail]
 
 
 @njit(cache=True)

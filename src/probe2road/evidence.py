@@ -6,29 +6,19 @@ Only numbers leave here: how many traces, drives and vehicles, never which, and 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import shapely
 from numpy.typing import NDArray
 from scipy.special import betaln
 
 from probe2road.crs import same_crs
-from probe2road.edge_frame import (
-    FramedFixes,
-    Stations,
-    Traversals,
-    courses,
-    edge_lines,
-    frame,
-    robust_sigma,
-    smooth_stations,
-    stations_along,
-)
+from probe2road.edge_frame import FramedFixes, Traversals, edge_lines, frame, robust_sigma
 from probe2road.errors import CRSError, OptionError
 from probe2road.fleet import Fleet
+from probe2road.heights import HeightOptions, with_heights
 from probe2road.mapmatch import Matches, turn_counts
 from probe2road.roadgraph import RoadGraph
 
@@ -49,8 +39,6 @@ EVIDENCE_COLUMNS = (
     "height_spread",  # m, 1 sigma of the heights about the profile
 )
 
-_SIGMA_OF_MAD = 1.4826  # ratio of a normal law
-_ROUNDS = 12  # of the alternation between profile and bias; the last ones move heights by millimetres
 _TURNED = ("yes", "-1", "no")
 
 
@@ -65,28 +53,20 @@ class EvidenceOptions:
     imbalance: float = 2.0  # a of Beta(a, a), the law of the share of one direction on two-way roads
     oneway_share: float = 0.5  # of edges that are one-way, before anything was counted
     max_interval: float = 60.0  # s; longer intervals between fixes do not count for the speed
-    station_spacing: float = 10.0  # m between the places at which heights are estimated
-    bias_length: float = 500.0  # m driven, over which a trace is wrong about its height by the same amount
-    bias_sigma: float = 4.0  # m, of that amount
-    height_sigma: float = 0.5  # m, of heights about it, at least; what is seen where that is more
-    height_reach: float = 100.0  # m; shorter humps are levelled
-    height_tolerance: float = 0.15  # m, by which the profile may be simplified
-    same_height: float = 1.5  # m; edge ends at a node that differ by less meet at one height
+    heights: HeightOptions = field(default_factory=HeightOptions)  # how heights are estimated
 
     def __post_init__(self) -> None:
-        """Refuse negative numbers and probabilities above 1."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not value >= 0:
+        """Refuse negative numbers, and probabilities that are none or certain."""
+        for name in ("min_cover", "drive_pause", "max_interval"):
+            if not getattr(self, name) >= 0:
                 fix = "use a number that is not negative"
-                raise OptionError(f"{field.name} is {value}", where="EvidenceOptions", fix=fix)
+                raise OptionError(f"{name} is {getattr(self, name)}", where="EvidenceOptions", fix=fix)
         for name in ("min_confidence", "wrong_way", "oneway_share"):
             if not 0 < getattr(self, name) < 1:
                 fix = "use a number between 0 and 1"
                 raise OptionError(f"{name} is {getattr(self, name)}", where="EvidenceOptions", fix=fix)
-        for name in ("imbalance", "station_spacing", "bias_length", "bias_sigma", "height_sigma"):
-            if not getattr(self, name) > 0:
-                raise OptionError(f"{name} is 0", where="EvidenceOptions", fix="use a positive number")
+        if not self.imbalance > 0:
+            raise OptionError(f"imbalance is {self.imbalance}", where="EvidenceOptions", fix="use a positive number")
 
 
 def add_evidence(
@@ -148,7 +128,7 @@ def add_evidence(
     }
     edges = graph.edges.assign(**counted, **measured)
     known = replace(graph, edges=edges.assign(**_oneway(edges, options)), turns=turn_counts(matches, graph))
-    known = _with_heights(known, fleet, driven, fixes, options)
+    known = with_heights(known, fleet, driven, fixes, options=options.heights)
     logger.info(
         "%d of %d edges and %d turns were driven; %d edges are one-way, %d are not",
         int((edges["support"] > 0).sum()), len(edges), len(known.turns),
@@ -305,103 +285,3 @@ def _speeds(
         mean = np.divide(np.bincount(told_edge, told, n), count, out=np.full(n, np.nan), where=count > 0)
         speed = np.where(np.isfinite(speed), speed, mean)
     return speed
-
-
-def _with_heights(
-    graph: RoadGraph, fleet: Fleet, driven: Traversals, fixes: FramedFixes, options: EvidenceOptions
-) -> RoadGraph:
-    """Give edges the heights their traces agree on, and ``height_spread``."""
-    z = fleet.traces["z"].to_numpy(np.float64)[fixes.row]
-    known = np.isfinite(z)
-    empty = np.full(len(graph.edges), np.nan)
-    if not known.any():
-        return replace(graph, edges=graph.edges.assign(height_spread=empty))
-    lines = edge_lines(graph)
-    stations = stations_along(lines.length, options.station_spacing)
-    edge = driven.edge[fixes.traversal]
-    place = stations.nearest(edge, fixes.along)[known]
-    stretch = _stretches(fleet, fixes.row, driven.trace[fixes.traversal], options.bias_length)[known]
-    height, left_over, weight = _heights_without_bias(z[known], place, stretch, len(stations.edge), options)
-    has = np.bincount(stations.edge, weight, len(graph.edges)) > 0
-    mean = np.bincount(stations.edge, np.where(weight > 0, weight * height, 0.0), len(graph.edges))
-    mean = np.divide(mean, np.bincount(stations.edge, weight, len(graph.edges)), out=np.zeros(len(has)), where=has)
-    level = mean[stations.edge]
-    profile = level + smooth_stations(height - level, weight, stations, reach=options.height_reach, pull=1e-6)
-    profile = _joined_at_nodes(graph, stations, profile, has, options.same_height)
-    geometry = _profiled(graph, stations, profile, has, options.height_tolerance)
-    spread = robust_sigma(left_over, edge[known], len(graph.edges))
-    return replace(graph, edges=graph.edges.set_geometry(geometry, crs=graph.crs).assign(height_spread=spread))
-
-
-def _stretches(fleet: Fleet, row: NDArray[np.int64], trace: NDArray[np.int64], longest: float) -> NDArray[np.int64]:
-    """Cut traces into stretches of so many metres, over which the bias of the height is one number."""
-    xy = fleet.traces[["x", "y"]].to_numpy(np.float64)
-    step = np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)
-    step[fleet.starts[:-1]] = 0.0
-    driven = np.cumsum(step)
-    driven -= np.repeat(driven[fleet.starts[:-1]], np.diff(fleet.starts))
-    piece = (driven[row] / longest).astype(np.int64)
-    return pd.factorize(trace * (int(piece.max(initial=0)) + 1) + piece)[0].astype(np.int64)
-
-
-def _heights_without_bias(
-    z: NDArray[np.float64],
-    place: NDArray[np.int64],
-    stretch: NDArray[np.int64],
-    n_places: int,
-    options: EvidenceOptions,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Separate what places are high from what stretches of traces are wrong about it.
-
-    Alternates between the two; each is a mean in which outliers count less (Cauchy's weights), and the bias is drawn
-    towards zero, which fixes the level of the whole. Returns heights ``(n_places,)``, what is left over of every fix,
-    and the weight of each place: how many stretches passed it, down-weighted where they disagree.
-    """
-    cells = pd.DataFrame({"place": place, "stretch": stretch, "z": z}).groupby(["place", "stretch"])["z"].median()
-    at, of, value = (cells.index.codes[0].astype(np.int64), cells.index.codes[1].astype(np.int64), cells.to_numpy())
-    at, of = cells.index.levels[0].to_numpy()[at], cells.index.levels[1].to_numpy()[of]
-    n_stretches = int(stretch.max()) + 1
-    middle = pd.Series(value).groupby(at).median()
-    height, bias, weight = np.full(n_places, np.nan), np.zeros(n_stretches), np.ones(len(value))
-    height[middle.index.to_numpy()] = middle.to_numpy()
-    sigma = options.height_sigma
-    for _ in range(_ROUNDS):
-        away = value - height[at]
-        pull = (sigma / options.bias_sigma) ** 2
-        bias = np.bincount(of, weight * away, n_stretches) / (np.bincount(of, weight, n_stretches) + pull)
-        total = np.bincount(at, weight, n_places)
-        sums = np.bincount(at, weight * (value - bias[of]), n_places)
-        height = np.divide(sums, total, out=np.full(n_places, np.nan), where=total > 0)
-        off = value - bias[of] - height[at]
-        sigma = max(options.height_sigma, _SIGMA_OF_MAD * float(np.median(np.abs(off))))
-        weight = 1.0 / (1.0 + (off / (3.0 * sigma)) ** 2)
-    left_over: NDArray[np.float64] = z - bias[stretch] - height[place]
-    return height, left_over, np.bincount(at, weight, n_places).astype(np.float64)
-
-
-def _joined_at_nodes(
-    graph: RoadGraph, stations: Stations, profile: NDArray[np.float64], has: NDArray[np.bool_], tolerance: float
-) -> NDArray[np.float64]:
-    """Let edges that end at a node within a tolerance (m) of each other end at the same height."""
-    end = np.stack([stations.first[:-1], stations.first[1:] - 1], axis=1).ravel()
-    ends = pd.DataFrame({"node": graph.edges[["u", "v"]].to_numpy().ravel(), "z": profile[end]})[np.repeat(has, 2)]
-    of_node = ends.groupby("node")["z"]
-    middle = of_node.transform("mean")
-    shift = np.zeros(2 * len(has))
-    shift[ends.index] = np.where(
-        (of_node.transform("max") - of_node.transform("min")) <= tolerance, middle - ends["z"], 0
-    )
-    share = stations.along / np.maximum(stations.along[stations.first[1:] - 1][stations.edge], 1e-9)
-    return profile + (1 - share) * shift[2 * stations.edge] + share * shift[2 * stations.edge + 1]
-
-
-def _profiled(
-    graph: RoadGraph, stations: Stations, profile: NDArray[np.float64], has: NDArray[np.bool_], tolerance: float
-) -> NDArray[Any]:
-    """Put heights into the lines of edges; stations become vertices where the profile needs them."""
-    lines = edge_lines(graph)
-    needed = has[stations.edge] & stations.bends(profile, tolerance)
-    edge, along, xyz = courses(lines, stations, needed)
-    xyz[:, 2] = np.where(has[edge], stations.interpolate(profile, edge, along), xyz[:, 2])
-    made = shapely.linestrings(xyz, indices=edge)
-    return np.where(has | shapely.has_z(graph.edges.geometry.to_numpy()), made, shapely.force_2d(made))
