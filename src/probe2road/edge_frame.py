@@ -242,7 +242,7 @@ def frame(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[Traversals,
 
 
 def _steps(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[NDArray[Any], ...]:
-    """Return trace, edge, forward, entered and left of every traversal, shape (T,): steps, those of one drive as one."""
+    """Return trace, edge, forward, entered and left of every traversal, shape (T,); broken steps are joined."""
     steps = matches.steps
     edge = graph.edges.index.get_indexer(steps["edge"]).astype(np.int64)
     if (edge < 0).any():
