@@ -1,0 +1,113 @@
+"""What each step of the refinement gives on the benchmark's test cities: the rows of the paper's Table V, and ours.
+
+Usage: python benchmarks/refinement.py FOLDER [NAMES...] [--pictures docs/img]
+
+FOLDER holds the data sets that `probe2road benchmark prepare` made. The density segmenter builds from the aligned
+fleet data; scores are against the reference kept where at least four drives pass. Prints Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from probe2road.benchmark.reference import labelled_reference
+from probe2road.centreline import refine_centreline
+from probe2road.clean import clean_graph
+from probe2road.crs import WGS84, transform
+from probe2road.disambiguate import DisambiguateOptions, split_false_junctions
+from probe2road.evidence import add_evidence
+from probe2road.export import read_graph
+from probe2road.fleet import Fleet
+from probe2road.gaps import fill_gaps, gap_weights, prune_gaps
+from probe2road.io.fleet_reader import read_fleet
+from probe2road.mapmatch import match
+from probe2road.metrics import evaluate
+from probe2road.passages import passing_positions
+from probe2road.picture import draw_graph
+from probe2road.recipe import BuildOptions, build
+from probe2road.roadgraph import RoadGraph
+
+CITIES = ("boston", "hannover", "tokyo_shibuya")
+# Latitude and longitude of the densest interchanges.
+PLACES = {"boston": [(42.3678, -71.0632), (42.3686, -71.0259)], "hannover": [(52.4272, 9.8867)]}
+REACH = 450.0  # m, half the side of a picture
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table."""
+
+    step: str
+    graph: RoadGraph
+    seconds: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("names", nargs="*", default=CITIES)
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of the densest interchanges")
+    arguments = parser.parse_args()
+    for name in arguments.names:
+        folder = arguments.folder / name
+        fleet = read_fleet(folder / "aligned.parquet", folder / "aligned.points.parquet")
+        reference = labelled_reference(read_graph(folder / "reference.gpkg"))
+        print(f"\n## {name}\n\n| step | GEO F1/P/R | iTOPO F1/P/R | TOPO F1 | nodes | km | s |\n|{'---|' * 7}")
+        done = rows(fleet)
+        for row in done:
+            print(line(row, reference), flush=True)
+        for number, place in enumerate(PLACES.get(name, ())) if arguments.pictures else ():
+            area = around(place, fleet)
+            for when, row in (("before", done[0]), ("after", done[-1])):
+                path = arguments.pictures / f"refinement-{name}-{number + 1}-{when}.png"
+                draw_graph(row.graph, path, fleet=fleet, reference=reference, bounds=area, width=6)
+
+
+def around(place: tuple[float, float], fleet: Fleet) -> tuple[float, float, float, float]:
+    """Return the bounds of a picture of a place."""
+    x, y = transform([place[1]], [place[0]], WGS84, fleet.crs)
+    return x[0] - REACH, y[0] - REACH, x[0] + REACH, y[0] + REACH
+
+
+def rows(fleet: Fleet) -> list[Row]:
+    """Refine step by step."""
+    done, started = [], time.perf_counter()
+
+    def note(step: str, graph: RoadGraph) -> None:
+        nonlocal started
+        done.append(Row(step, graph, time.perf_counter() - started))
+        started = time.perf_counter()
+
+    built = build(fleet, BuildOptions(refine=False))
+    note("no post-processing", built)
+    filled = fill_gaps(built)
+    matches = match(fleet, filled, edge_weights=gap_weights(filled))
+    graph = clean_graph(prune_gaps(filled, matches.steps))
+    note("gap filling", graph)
+    matches = match(fleet, graph)
+    for variant in ("literal", "guarded"):
+        options = DisambiguateOptions(variant=variant)
+        note(f"disambiguation, {variant}", split_false_junctions(graph, matches.steps, options=options))
+    positions = passing_positions(fleet, matches, graph)
+    split = split_false_junctions(graph, matches.steps, positions=positions)
+    note("guarded, with heights", split)
+    matches = match(fleet, split)
+    note("centrelines moved", refine_centreline(add_evidence(split, fleet, matches), fleet, matches))
+    return done
+
+
+def line(row: Row, reference: RoadGraph) -> str:
+    """Score a graph."""
+    plain = replace(row.graph, turns=row.graph.turns.iloc[:0])
+    scores = evaluate(plain, reference, metrics=["geo", "itopo", "topo"]).itertuples()
+    geo, itopo = (f"{score.f1:.4f}/{score.precision:.3f}/{score.recall:.3f}" for score in (next(scores), next(scores)))
+    topo = f"{next(scores).f1:.4f}"
+    size = f"{len(row.graph.nodes)} | {row.graph.length / 1000:.1f} | {row.seconds:.0f}"
+    return f"| {row.step} | {geo} | {itopo} | {topo} | {size} |"
+
+
+if __name__ == "__main__":
+    main()
