@@ -148,3 +148,11 @@ def test_driving_direction_follows_the_tag_and_then_the_counts(tee: RoadGraph) -
     assert driving_direction(edges, min_count=4).tolist() == [1, -1, 0]
     assert driving_direction(edges.assign(oneway=["no", None, "-1"]), min_count=4).tolist() == [0, -1, -1]
     assert driving_direction(edges.assign(oneway=[False, True, False])).tolist() == [0, 1, 0]
+
+
+def test_weighed_evidence_outranks_bare_counts() -> None:
+    edges = graph_from_lines([[(0, 0), (90, 0)], [(90, 0), (90, 90)]], crs="EPSG:32616").edges
+    counted = edges.assign(forward=[7, 7], backward=[0, 0])
+    assert driving_direction(counted).tolist() == [1, 1]
+    weighed = counted.assign(oneway=["yes", None], oneway_confidence=[0.95, 0.8])
+    assert driving_direction(weighed).tolist() == [1, 0]

@@ -229,10 +229,11 @@ def empty_turns() -> pd.DataFrame:
 def driving_direction(edges: gpd.GeoDataFrame, *, min_count: int = 5) -> pd.Series:
     """Say which way each edge may be driven: 1 from u to v only, -1 from v to u only, 0 both ways.
 
-    A column ``oneway`` that came with the data (an OSM tag, or a flag) decides where it has a value. Otherwise
-    the counts do: an edge that was driven ``min_count`` times or more, always the same way, is one-way. On a
-    two-way road with even traffic, five traversals agree by chance once in sixteen times; where the counts are
-    fewer or missing, the edge is open both ways.
+    A column ``oneway`` that came with the data (an OSM tag, or a flag) decides where it has a value. Where
+    `probe2road.evidence` weighed the counts already (column ``oneway_confidence``) and left the value open, the
+    edge is open both ways. Otherwise the counts decide: an edge that was driven ``min_count`` times or more,
+    always the same way, is one-way. On a two-way road with even traffic, five traversals agree by chance once in
+    sixteen times; where the counts are fewer or missing, the edge is open both ways.
 
     Parameters
     ----------
@@ -253,8 +254,9 @@ def driving_direction(edges: gpd.GeoDataFrame, *, min_count: int = 5) -> pd.Seri
     """
     forward, backward = (edges[name].to_numpy(np.float64, na_value=0.0) for name in ("forward", "backward"))
     direction = pd.Series(0, index=edges.index, name="direction")
-    direction[(forward >= min_count) & (backward == 0)] = 1
-    direction[(backward >= min_count) & (forward == 0)] = -1
+    if "oneway_confidence" not in edges:
+        direction[(forward >= min_count) & (backward == 0)] = 1
+        direction[(backward >= min_count) & (forward == 0)] = -1
     if "oneway" in edges:
         tag = edges["oneway"].astype("str").str.lower()
         for value, tags in (
