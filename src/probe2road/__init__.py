@@ -18,9 +18,12 @@ if TYPE_CHECKING:
     from probe2road.io.fleet_summary import describe_fleet
     from probe2road.io.fleet_writer import write_fleet
     from probe2road.io.graph_networkx import from_networkx, to_networkx
+    from probe2road.labels import label_reference
+    from probe2road.mapmatch import Matches, MatchOptions, match
     from probe2road.metrics.evaluate import evaluate
     from probe2road.raster import rasterize
     from probe2road.recipe import BuildOptions, build
+    from probe2road.refinement import refine_graph
     from probe2road.roadgraph import RoadGraph, check_graph, graph_from_lines
     from probe2road.view import write_view
 
@@ -40,6 +43,11 @@ _HOME = {
     "to_networkx": "io.graph_networkx",
     "from_networkx": "io.graph_networkx",
     "rasterize": "raster",
+    "MatchOptions": "mapmatch",
+    "Matches": "mapmatch",
+    "match": "mapmatch",
+    "refine_graph": "refinement",
+    "label_reference": "labels",
     "BuildOptions": "recipe",
     "build": "recipe",
     "evaluate": "metrics.evaluate",
@@ -49,6 +57,8 @@ _HOME = {
 __all__ = [
     "BuildOptions",
     "Fleet",
+    "MatchOptions",
+    "Matches",
     "Probe2RoadError",
     "RoadGraph",
     "TraceGaps",
@@ -60,9 +70,12 @@ __all__ = [
     "fleet_from_tables",
     "from_networkx",
     "graph_from_lines",
+    "label_reference",
+    "match",
     "rasterize",
     "read_fleet",
     "read_graph",
+    "refine_graph",
     "to_networkx",
     "write_fleet",
     "write_graph",
