@@ -43,6 +43,8 @@ PLACES = {
     "tokyo_shibuya": (139.6950, 35.6540),
     "columbus": (-82.9840, 39.9738),
     "milan": (9.2512, 45.4621),
+    "rhein_neckar": (8.4427, 49.4873),
+    "porto": (-8.6041, 41.1264),
 }
 HALF = 300.0  # m, half the side of a picture
 SHOWN = 150  # drives in the first panel; more would cover each other

@@ -27,6 +27,8 @@ from probe2road.picture import draw_graph
 from probe2road.roadgraph import RoadGraph, graph_from_lines
 
 CITIES = {"chicago_shuttle": ("EPSG:32616", "trace_id=trip"), "athens_small": ("EPSG:2100", "trace_id=trip")}
+JUNCTIONS = {"chicago_shuttle": 3, "athens_small": 0}  # pictures of the busiest
+CLOSE = 120.0  # m, half the side of the picture of a junction
 MIN_TRIPS = 4  # trips near an edge from which the reference counts as sufficiently driven
 
 # F at 5, 10, 15 and 20 m against gt_traversed_tang, as published.
@@ -107,6 +109,22 @@ def report(city: str, folder: Path, pictures: Path | None) -> None:
     if pictures:
         fleet = read_fleet(folder / "traces.csv.gz", columns={"trace_id": "trip"}, crs=CITIES[city][0])
         draw_graph(graph, pictures / f"real-{city}.png", fleet=fleet, reference=lines)
+        for number, (x, y) in enumerate(busiest_junctions(graph)[: JUNCTIONS[city]], start=1):
+            area = (x - CLOSE, y - CLOSE, x + CLOSE, y + CLOSE)
+            path = pictures / f"real-{city}-junction-{number}.png"
+            draw_graph(graph, path, fleet=fleet, reference=lines, bounds=area, width=5)
+
+
+def busiest_junctions(graph: RoadGraph) -> list[tuple[float, float]]:
+    """Return the places of the junctions with the most turns, none within a picture of another."""
+    driven = graph.turns.groupby("via_node")["count"].sum()
+    degrees = graph.degrees()
+    junctions = driven[degrees[driven.index] >= 3].sort_values(ascending=False, kind="stable")
+    found: list[tuple[float, float]] = []
+    for point in graph.nodes.geometry[junctions.index]:
+        if all(max(abs(point.x - x), abs(point.y - y)) > 2 * CLOSE for x, y in found):
+            found.append((point.x, point.y))
+    return found
 
 
 def own_metrics(graph: RoadGraph, references: dict[str, RoadGraph]) -> None:
