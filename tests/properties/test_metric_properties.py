@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 import shapely.affinity
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from probe2road.metrics import GeoOptions, evaluate, geo, itopo
@@ -66,6 +66,8 @@ def test_moving_both_graphs_changes_nothing(first: list[Any], second: list[Any],
 @given(street_lines(), st.data())
 def test_cutting_edges_changes_nothing(lines: list[Any], data: st.DataObject) -> None:
     """Cut some edges at their bends: merging nodes of degree 2 undoes it, up to direction."""
+    drawn = [shapely.LineString(line) for line in lines]
+    assume(shapely.length(shapely.union_all(drawn)) > sum(map(shapely.length, drawn)) - 0.01)  # twin pieces are one
     pieces = []
     for line in lines:
         cut = data.draw(st.booleans())
