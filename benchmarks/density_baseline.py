@@ -35,6 +35,7 @@ from probe2road.recipe import BuildOptions
 from probe2road.roadgraph import RoadGraph
 
 METRICS = ("geo", "itopo", "topo")
+NAMES = {"geo": "GEO", "itopo": "iTOPO", "topo": "TOPO"}
 MIN_DRIVES = 4
 # Densest interchange of each extract: longitude, latitude.
 PLACES = {
@@ -84,7 +85,7 @@ def report(name: str, recording: Recording, pictures: Path | None) -> None:
     print(
         f"Reference: {km(driven, area):.1f} km with {MIN_DRIVES} drives or more, {km(reference, area):.1f} km in all.\n"
     )
-    columns = [f"{metric.upper()} F1/P/R" for metric in METRICS]
+    columns = [f"{NAMES[metric]} F1/P/R" for metric in METRICS]
     print(f"| fleet data | built | s | against | {' | '.join(columns)} |\n|---|---|---|---|{'---|' * len(columns)}")
     for source, path in (("aligned", recording.aligned), ("raw", recording.drives)):
         fleet = read_fleet(path, points_path(path))
