@@ -1,4 +1,4 @@
-"""What belongs to the tree as a whole: layering, start-up time, and documents that agree with the code."""
+"""What belongs to the tree as a whole: layering, what an import loads, and documents that agree with the code."""
 
 from __future__ import annotations
 
@@ -96,18 +96,11 @@ def test_public_verbs_are_there() -> None:
     assert [name for name in probe2road.__all__ if not hasattr(probe2road, name)] == []
 
 
-def test_import_is_quick_and_loads_nothing_heavy() -> None:
-    code = (
-        "import json, sys, time; before = set(sys.modules); start = time.perf_counter(); import probe2road; "
-        "print(json.dumps([time.perf_counter() - start, sorted(set(sys.modules) - before)]))"
-    )
-    # The best of three, because the machine may be busy with other tests.
-    runs = [
-        json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
-        for _ in range(3)
-    ]
-    assert min(seconds for seconds, _ in runs) < 0.5
-    assert {"torch", "geopandas", "numba", "pandas", "matplotlib"}.isdisjoint(runs[0][1])
+def test_import_loads_nothing_heavy() -> None:
+    code = "import json, sys, probe2road; print(json.dumps([*sys.modules]))"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(json.loads(run.stdout))
+    assert {"torch", "geopandas", "numba", "numpy", "pandas", "scipy", "matplotlib"}.isdisjoint(loaded)
 
 
 def test_version_is_that_of_the_package() -> None:
