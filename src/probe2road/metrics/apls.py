@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 from probe2road.metrics.matching import require_positive
 from probe2road.metrics.network import EPSILON, Network, locate
 from probe2road.metrics.normalise import comparable_networks
-from probe2road.metrics.scores import Score, f_score, ratio
+from probe2road.metrics.scores import Score
 from probe2road.roadgraph import RoadGraph
 
 __all__ = ["AplsOptions", "apls", "apls_networks"]
@@ -85,18 +85,14 @@ def apls_networks(proposal: Network, reference: Network, options: AplsOptions) -
     """Score normalised networks, as `apls`."""
     proposed_similar, proposed = _similarity(proposal, reference, options)
     wanted_similar, wanted = _similarity(reference, proposal, options)
-    precision, recall = ratio(proposed_similar, proposed), ratio(wanted_similar, wanted)
-    return Score(
+    return Score.from_counts(
         "apls",
-        precision,
-        recall,
-        f_score(precision, recall),
-        proposed_similar,
-        float(proposed),
-        wanted_similar,
-        float(wanted),
-        asdict(options),
-        {"proposal_km": round(proposal.km, 3), "reference_km": round(reference.km, 3)},
+        matched_proposal=proposed_similar,
+        proposal=proposed,
+        matched_reference=wanted_similar,
+        reference=wanted,
+        parameters=asdict(options),
+        details={"proposal_km": round(proposal.km, 3), "reference_km": round(reference.km, 3)},
     )
 
 

@@ -23,7 +23,7 @@ from probe2road.metrics.matching import require_positive
 from probe2road.metrics.network import EPSILON, Network, locate
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import Centres, Samples, sample_around
-from probe2road.metrics.scores import Score, f_score, ratio
+from probe2road.metrics.scores import Score, ratio
 from probe2road.roadgraph import RoadGraph
 
 __all__ = ["ItopoOptions", "Pairs", "itopo", "itopo_networks", "itopo_pairs"]
@@ -132,7 +132,6 @@ def itopo_networks(proposal: Network, reference: Network, options: ItopoOptions)
         "itopo_strict" if options.strict else "itopo",
         precision,
         recall,
-        f_score(precision, recall),
         float(proposed_matched.sum()),
         float(proposed.sum()),
         float(wanted_matched.sum()),

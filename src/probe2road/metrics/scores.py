@@ -33,7 +33,7 @@ class Score:
     ----------
     metric
         Its name, such as ``geo``.
-    precision, recall, f1
+    precision, recall
         In [0, 1]; 0 where there is nothing to score.
     matched_proposal, proposal, matched_reference, reference
         The counts behind them (samples, pixels, pairs, or metres for buffer GEO).
@@ -46,7 +46,6 @@ class Score:
     metric: str
     precision: float
     recall: float
-    f1: float
     matched_proposal: float
     proposal: float
     matched_reference: float
@@ -72,7 +71,6 @@ class Score:
             metric,
             precision,
             recall,
-            f_score(precision, recall),
             float(matched_proposal),
             float(proposal),
             float(matched_reference),
@@ -80,6 +78,11 @@ class Score:
             dict(parameters),
             dict(details or {}),
         )
+
+    @property
+    def f1(self) -> float:
+        """Harmonic mean of precision and recall."""
+        return f_score(self.precision, self.recall)
 
     def __str__(self) -> str:
         parameters = ", ".join(f"{name}={value}" for name, value in self.parameters.items())
@@ -123,7 +126,8 @@ def scores_table(scores: Iterable[Score]) -> pd.DataFrame:
     0
     """
     rows = [
-        vars(score) | {"parameters": json.dumps(dict(score.parameters)), "details": json.dumps(dict(score.details))}
+        vars(score)
+        | {"f1": score.f1, "parameters": json.dumps(dict(score.parameters)), "details": json.dumps(dict(score.details))}
         for score in scores
     ]
     return pd.DataFrame(rows, columns=list(SCORE_DTYPES)).astype(SCORE_DTYPES)

@@ -18,7 +18,7 @@ from probe2road.metrics.matching import match_one_to_one, require_positive
 from probe2road.metrics.network import EPSILON, Network, locate
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import Centres, Samples, component_roots, sample_around
-from probe2road.metrics.scores import Score, f_score, ratio
+from probe2road.metrics.scores import Score, ratio
 from probe2road.roadgraph import RoadGraph
 
 __all__ = ["TopoOptions", "topo", "topo_networks"]
@@ -109,7 +109,6 @@ def topo_networks(proposal: Network, reference: Network, options: TopoOptions) -
         "topo",
         precision,
         recall,
-        f_score(precision, recall),
         float(matched.sum()),
         float(proposed.sum()),
         float(matched.sum()),
