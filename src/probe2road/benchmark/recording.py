@@ -27,6 +27,7 @@ from probe2road.benchmark.residual import ResidualModel, align_drives
 from probe2road.errors import OptionError, OutputError
 from probe2road.export import write_graph
 from probe2road.io.atomic import atomic_path
+from probe2road.io.fleet_writer import ROW_GROUP, bounding_box, point_table, with_geo
 from probe2road.recipe import Progress
 from probe2road.roadgraph import RoadGraph
 from probe2road.simulate.fleet_simulation import FleetChunk, simulate_chunks
@@ -43,7 +44,6 @@ RUN_FILE = "run.json"
 _FORMAT = 1  # raised when what a recording holds changes
 _PORTIONS = ".portions"
 _DRIVES = 20  # drives in a portion: some 300 km, 600,000 points
-_ROW_GROUP = 262_144  # rows, as in `probe2road.io.fleet_writer`
 # Table of a portion to the file that the tables of all portions become.
 _FILES = {
     "traces": "drives.parquet",
@@ -268,27 +268,12 @@ def _write_portion(chunk: FleetChunk, path: Path, residual: ResidualModel | None
     with atomic_path(path) as temporary:
         temporary.mkdir()
         for name, table in tables.items():
-            pq.write_table(_arrow(table), temporary / f"{name}.parquet", compression="zstd")
-            boxes[name] = _box(table)
+            placed = "x" in table
+            columns = point_table(table) if placed else pa.Table.from_pandas(table, preserve_index=False)
+            pq.write_table(columns, temporary / f"{name}.parquet", compression="zstd")
+            boxes[name] = bounding_box(table) if placed else None
         about = {"drives": len(chunk.length), "km": float(chunk.length.sum()) / 1000.0, "boxes": boxes}
         (temporary / "about.json").write_text(json.dumps(about), encoding="utf-8")
-
-
-def _arrow(table: pd.DataFrame) -> pa.Table:
-    """Turn a table into Arrow; positions become one column of native points, as GeoParquet has them."""
-    if "x" not in table:
-        return pa.Table.from_pandas(table, preserve_index=False)
-    axes = [pa.array(table[axis].to_numpy(np.float64), pa.float64(), from_pandas=False) for axis in "xyz"]
-    points = pa.StructArray.from_arrays(axes, fields=[pa.field(axis, pa.float64(), False) for axis in "xyz"])
-    columns = pa.Table.from_pandas(table.drop(columns=list("xyz")), preserve_index=False)
-    return columns.append_column(pa.field("geometry", points.type, False), points)
-
-
-def _box(table: pd.DataFrame) -> list[float] | None:
-    """Bounding box ``[left, bottom, right, top]``, None where there is no position."""
-    if "x" not in table or table.empty:
-        return None
-    return [float(value) for value in (*table[["x", "y"]].min(), *table[["x", "y"]].max())]
 
 
 def _join(network: RoadNetwork, portions: Path, recording: Recording, run: Mapping[str, Any]) -> dict[str, float]:
@@ -319,9 +304,7 @@ def _join_table(parts: list[Path], name: str, target: Path, crs: Mapping[str, An
     schema = pq.read_schema(parts[0] / f"{name}.parquet")
     if boxes:
         lows, highs = np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]
-        about = {"encoding": "point", "geometry_types": ["Point Z"], "crs": crs, "bbox": [*lows, *highs]}
-        geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": about}}
-        schema = schema.with_metadata({**(schema.metadata or {}), b"geo": json.dumps(geo).encode()})
+        schema = with_geo(schema, crs, [*lows, *highs])
     # Times and ids rise in small steps: their differences take a third of the space.
     rising = {column: "DELTA_BINARY_PACKED" for column in ("trace_id", "t") if column in schema.names}
     repeated = [column for column in ("kind", "section", "lane") if column in schema.names]
@@ -334,7 +317,7 @@ def _join_table(parts: list[Path], name: str, target: Path, crs: Mapping[str, An
     ):
         for part in parts:
             table = pq.read_table(part / f"{name}.parquet", partitioning=None)
-            writer.write_table(table.replace_schema_metadata(schema.metadata), row_group_size=_ROW_GROUP)
+            writer.write_table(table.replace_schema_metadata(schema.metadata), row_group_size=ROW_GROUP)
             rows += table.num_rows
     return rows
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,11 @@ from probe2road.fleet import Fleet
 from probe2road.io.atomic import atomic_path
 from probe2road.io.sources import FORMATS, POINTS_MARK
 
-__all__ = ["points_path", "write_fleet"]
+__all__ = ["ROW_GROUP", "bounding_box", "point_table", "points_path", "with_geo", "write_fleet"]
 
 logger = logging.getLogger(__name__)
 
-_ROW_GROUP = 262_144  # rows; small enough that a bounding box skips some, large enough to compress
+ROW_GROUP = 262_144  # rows; small enough that a bounding box skips some, large enough to compress
 
 
 def points_path(path: str | PathLike[str]) -> Path:
@@ -89,22 +90,36 @@ def write_fleet(fleet: Fleet, path: str | PathLike[str]) -> list[Path]:
     return written
 
 
-def _write_table(table: pd.DataFrame, crs: dict[str, Any], path: Path) -> None:
-    """Write one table with its positions as a column of native points."""
-    axes = "xyz" if np.isfinite(table["z"].to_numpy()).any() else "xy"
-    coordinates = [pa.array(table[axis].to_numpy(), pa.float64(), from_pandas=False) for axis in axes]
+def point_table(table: pd.DataFrame, axes: str = "xyz") -> pa.Table:
+    """Turn a table into Arrow, its positions into one column of native points as GeoParquet has them."""
+    coordinates = [pa.array(table[axis].to_numpy(np.float64), pa.float64(), from_pandas=False) for axis in axes]
     geometry = pa.StructArray.from_arrays(coordinates, fields=[pa.field(axis, pa.float64(), False) for axis in axes])
     columns = pa.Table.from_pandas(table.drop(columns=list("xyz")), preserve_index=False)
-    columns = columns.append_column(pa.field("geometry", geometry.type, False), geometry)
-    x, y = table["x"].to_numpy(), table["y"].to_numpy()
+    return columns.append_column(pa.field("geometry", geometry.type, False), geometry)
+
+
+def with_geo(schema: pa.Schema, crs: Mapping[str, Any], bbox: Sequence[float] | None) -> pa.Schema:
+    """Return the schema of a `point_table` with the metadata that make a file of it GeoParquet 1.1."""
+    heights = schema.field("geometry").type.num_fields == 3
     about: dict[str, Any] = {
         "encoding": "point",
-        "geometry_types": ["Point Z" if axes == "xyz" else "Point"],
+        "geometry_types": ["Point Z" if heights else "Point"],
         "crs": crs,
     }
-    if len(table):
-        about["bbox"] = [float(x.min()), float(y.min()), float(x.max()), float(y.max())]
+    if bbox is not None:
+        about["bbox"] = list(bbox)
     geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": about}}
-    columns = columns.replace_schema_metadata({**(columns.schema.metadata or {}), b"geo": json.dumps(geo).encode()})
+    return schema.with_metadata({**(schema.metadata or {}), b"geo": json.dumps(geo).encode()})
+
+
+def bounding_box(table: pd.DataFrame) -> list[float] | None:
+    """Return ``[left, bottom, right, top]`` of a table's positions, None where it has no rows."""
+    return None if table.empty else [float(value) for value in (*table[["x", "y"]].min(), *table[["x", "y"]].max())]
+
+
+def _write_table(table: pd.DataFrame, crs: Mapping[str, Any], path: Path) -> None:
+    """Write one table with its positions as a column of native points."""
+    columns = point_table(table, "xyz" if np.isfinite(table["z"].to_numpy()).any() else "xy")
+    columns = columns.replace_schema_metadata(with_geo(columns.schema, crs, bounding_box(table)).metadata)
     with atomic_path(path) as temporary:
-        pq.write_table(columns, temporary, compression="zstd", row_group_size=_ROW_GROUP)
+        pq.write_table(columns, temporary, compression="zstd", row_group_size=ROW_GROUP)
