@@ -6,9 +6,18 @@ prints that message and exits with code 2; a traceback therefore always means a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
-__all__ = ["CRSError", "InputError", "MissingExtraError", "OptionError", "OutputError", "Probe2RoadError"]
+__all__ = [
+    "CRSError",
+    "InputError",
+    "MissingExtraError",
+    "OptionError",
+    "OutputError",
+    "Probe2RoadError",
+    "needs_extra",
+]
 
 
 class Probe2RoadError(Exception):
@@ -70,8 +79,10 @@ class OutputError(Probe2RoadError):
     """An output cannot be written."""
 
 
-class MissingExtraError(Probe2RoadError):
+class MissingExtraError(Probe2RoadError, ImportError):
     """A feature needs an optional dependency that is not installed.
+
+    It is an `ImportError` as well, for programs that try a module and carry on without it.
 
     Examples
     --------
@@ -83,3 +94,37 @@ class MissingExtraError(Probe2RoadError):
     def for_extra(cls, extra: str, *, feature: str) -> MissingExtraError:
         """Build the error that prints the exact install line of an extra."""
         return cls(f"{feature} needs an optional dependency", fix=f"install it with: pip install 'probe2road[{extra}]'")
+
+
+@contextmanager
+def needs_extra(extra: str, *, feature: str) -> Iterator[None]:
+    """Turn a missing package among the imports in the block into the error that says what to install.
+
+    For the top of a module that cannot work without an optional dependency. A package that is there but broken
+    keeps its own error.
+
+    Parameters
+    ----------
+    extra
+        The extra of probe2road that brings the packages.
+    feature
+        What needs them, as the subject of the message.
+
+    Raises
+    ------
+    MissingExtraError
+        If a package that the block imports is not installed.
+
+    Examples
+    --------
+    >>> with needs_extra("train", feature="training the segmentation network"):
+    ...     import no_such_package
+    Traceback (most recent call last):
+        ...
+    probe2road.errors.MissingExtraError: training the segmentation network needs an optional dependency; install it
+    with: pip install 'probe2road[train]'
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MissingExtraError.for_extra(extra, feature=feature) from error
