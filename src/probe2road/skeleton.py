@@ -28,7 +28,8 @@ logger = logging.getLogger(__name__)
 Method = Literal["guo_hall", "zhang_suen"]
 
 _NO_LIMIT = 2**62  # iterations
-_SET, _QUEUED_FIRST, _QUEUED_SECOND = np.uint8(1), np.uint8(2), np.uint8(4)  # bits of a pixel's state
+# Bits of a pixel's state.
+_SET, _QUEUED_FIRST, _QUEUED_SECOND, _FIXED = np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(8)
 
 
 def skeletonize(mask: NDArray[Any], *, method: Method = "guo_hall") -> NDArray[np.bool_]:
@@ -84,6 +85,7 @@ def skeletonize_windows(
     window: int = 4096,
     halo: int = 64,
     method: Method = "guo_hall",
+    fixed: NDArray[Any] | None = None,
 ) -> NDArray[np.bool_]:
     """Thin a mask window by window, pixel for pixel as `skeletonize` thins the whole.
 
@@ -104,6 +106,8 @@ def skeletonize_windows(
         Context on every side of a window to begin with, pixels; roads up to about this wide need no second go.
     method
         As for `skeletonize`.
+    fixed
+        Pixels of the mask that thinning must not remove, shape ``(rows, cols)``: an earlier skeleton to grow.
 
     Returns
     -------
@@ -113,7 +117,7 @@ def skeletonize_windows(
     Raises
     ------
     InputError
-        If the mask does not have two dimensions, or ``out`` has another shape.
+        If the mask does not have two dimensions, or ``out`` or ``fixed`` has another shape.
     OptionError
         If the window or the halo is too small, or the method is unknown.
 
@@ -128,9 +132,10 @@ def skeletonize_windows(
         raise OptionError(f"window is {window} and halo is {halo}", fix="use at least 1 and 2 pixels")
     if out is None:
         out = np.zeros((rows, cols), bool)
-    if out.shape != (rows, cols):
-        raise InputError(f"out has shape {out.shape}, the mask {(rows, cols)}", fix="use the mask's shape")
-    while not _thin_windows(mask, out, window, halo, _deletion_table(method)):
+    for name, array in (("out", out), ("fixed", fixed)):
+        if array is not None and array.shape != (rows, cols):
+            raise InputError(f"{name} has shape {array.shape}, the mask {(rows, cols)}", fix="use the mask's shape")
+    while not _thin_windows(mask, fixed, out, window, halo, _deletion_table(method)):
         halo *= 2
         logger.info("the mask is wide: thinning again with a halo of %d pixels", halo)
     return out
@@ -155,7 +160,14 @@ def skeleton_pixels(skeleton: NDArray[Any], *, strip: int = 4096) -> tuple[NDArr
     return row, np.concatenate([part[1] for part in parts])
 
 
-def _thin_windows(mask: NDArray[Any], out: NDArray[np.bool_], window: int, halo: int, table: NDArray[np.bool_]) -> bool:
+def _thin_windows(
+    mask: NDArray[Any],
+    fixed: NDArray[Any] | None,
+    out: NDArray[np.bool_],
+    window: int,
+    halo: int,
+    table: NDArray[np.bool_],
+) -> bool:
     """Thin all windows; False where the halo proves too small for one of them."""
     rows, cols = mask.shape
     for top in range(0, rows, window):
@@ -166,6 +178,8 @@ def _thin_windows(mask: NDArray[Any], out: NDArray[np.bool_], window: int, halo:
                 out[core] = False
                 continue
             state = _padded_state(mask, top, left, height, width, halo=halo)
+            if fixed is not None:
+                state |= _FIXED * _padded_state(fixed, top, left, height, width, halo=halo)
             if _thin(state, table, halo // 2, halo) >= halo // 2:
                 return False
             inner = state[halo + 1 : halo + 1 + height, halo + 1 : halo + 1 + width]
@@ -211,18 +225,19 @@ def _deletion_table(method: Method) -> NDArray[np.bool_]:
     raise OptionError(f"method is {method!r}", where="skeletonize", fix="use 'guo_hall' or 'zhang_suen'")
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)  # threads can thin several masks at once
 def _thin(state: NDArray[np.uint8], table: NDArray[np.bool_], limit: int, margin: int) -> int:
     """Thin a padded state in place, for at most ``limit`` iterations.
 
     Returns the number of the last iteration that removed a pixel more than ``margin`` from the border.
 
     A pixel is queued for a sub-iteration when it has lost a neighbour since that sub-iteration last asked it.
+    Fixed pixels are asked, too, and stay.
     """
     rows, cols = state.shape
     pixels = state.reshape(-1)
     around = np.array([-cols, 1 - cols, 1, cols + 1, cols, cols - 1, -1, -cols - 1])  # clockwise from north
-    queue = _boundary(pixels, around, rows, cols)
+    queue = _boundary(pixels, around)
     queues = [queue, queue.copy()]
     size = np.array([len(queue), len(queue)])
     flags = (_QUEUED_FIRST, _QUEUED_SECOND)
@@ -238,7 +253,7 @@ def _thin(state: NDArray[np.uint8], table: NDArray[np.bool_], limit: int, margin
             for place in range(size[step]):
                 pixel = queues[step][place]
                 pixels[pixel] &= ~flags[step]
-                if pixels[pixel] & _SET and table[step, _neighbourhood(pixels, pixel, around)]:
+                if pixels[pixel] & (_SET | _FIXED) == _SET and table[step, _neighbourhood(pixels, pixel, around)]:
                     removed[n_removed] = pixel
                     n_removed += 1
             size[step] = 0
@@ -255,20 +270,16 @@ def _thin(state: NDArray[np.uint8], table: NDArray[np.bool_], limit: int, margin
 
 
 @njit(cache=True)
-def _boundary(pixels: NDArray[np.uint8], around: NDArray[np.int64], rows: int, cols: int) -> NDArray[np.int64]:
+def _boundary(pixels: NDArray[np.uint8], around: NDArray[np.int64]) -> NDArray[np.int64]:
     """List the pixels with background beside them, and mark them as queued for both sub-iterations."""
-    found = np.empty(1024, np.int64)
+    found = np.flatnonzero(pixels)  # the frame is background, so that every neighbourhood lies inside
     count = 0
-    for row in range(1, rows - 1):
-        for pixel in range(row * cols + 1, row * cols + cols - 1):
-            if pixels[pixel] and _neighbourhood(pixels, pixel, around) != 255:
-                if count == len(found):
-                    found = np.append(found, np.empty(count, np.int64))
-                found[count] = pixel
-                count += 1
-    for pixel in found[:count]:
-        pixels[pixel] |= _QUEUED_FIRST | _QUEUED_SECOND
-    return found[:count]
+    for pixel in found:
+        if _neighbourhood(pixels, pixel, around) != 255:
+            found[count] = pixel
+            pixels[pixel] |= _QUEUED_FIRST | _QUEUED_SECOND
+            count += 1
+    return found[:count].copy()
 
 
 @njit(cache=True)
