@@ -32,7 +32,9 @@ _NO_LIMIT = 2**62  # iterations
 _SET, _QUEUED_FIRST, _QUEUED_SECOND, _FIXED = np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(8)
 
 
-def skeletonize(mask: NDArray[Any], *, method: Method = "guo_hall") -> NDArray[np.bool_]:
+def skeletonize(
+    mask: NDArray[Any], *, method: Method = "guo_hall", fixed: NDArray[Any] | None = None
+) -> NDArray[np.bool_]:
     """Thin a mask to lines one pixel wide.
 
     With Guo-Hall connected parts stay connected, holes stay holes, and ends of lines are kept. Outside the mask
@@ -45,6 +47,8 @@ def skeletonize(mask: NDArray[Any], *, method: Method = "guo_hall") -> NDArray[n
         Shape ``(rows, cols)``; everything that is not zero is road.
     method
         ``guo_hall``, or ``zhang_suen``, which can wear away diagonals and squares two pixels wide.
+    fixed
+        Pixels of the mask that stay whatever is around them, shape ``(rows, cols)``: a skeleton to grow.
 
     Returns
     -------
@@ -53,7 +57,7 @@ def skeletonize(mask: NDArray[Any], *, method: Method = "guo_hall") -> NDArray[n
     Raises
     ------
     InputError
-        If the mask does not have two dimensions.
+        If the mask does not have two dimensions, or ``fixed`` has another shape.
     OptionError
         If the method is unknown.
 
@@ -71,7 +75,12 @@ def skeletonize(mask: NDArray[Any], *, method: Method = "guo_hall") -> NDArray[n
            [0, 1, 1, 1, 1, 1, 0],
            [0, 0, 0, 0, 0, 0, 0]])
     """
-    state = _padded_state(mask, 0, 0, *_shape_of(mask), halo=0)
+    rows, cols = _shape_of(mask)
+    state = _padded_state(mask, 0, 0, rows, cols, halo=0)
+    if fixed is not None:
+        if np.shape(fixed) != (rows, cols):
+            raise InputError(f"fixed has shape {np.shape(fixed)}, the mask {(rows, cols)}", fix="use the mask's shape")
+        state |= state * _FIXED * _padded_state(fixed, 0, 0, rows, cols, halo=0)
     iterations = _thin(state, _deletion_table(method), _NO_LIMIT, 0)
     skeleton = (state[1:-1, 1:-1] & _SET).astype(bool)
     logger.debug("thinned a mask of %d x %d pixels in %d iterations", *skeleton.shape, iterations)
@@ -85,7 +94,6 @@ def skeletonize_windows(
     window: int = 4096,
     halo: int = 64,
     method: Method = "guo_hall",
-    fixed: NDArray[Any] | None = None,
 ) -> NDArray[np.bool_]:
     """Thin a mask window by window, pixel for pixel as `skeletonize` thins the whole.
 
@@ -106,8 +114,6 @@ def skeletonize_windows(
         Context on every side of a window to begin with, pixels; roads up to about this wide need no second go.
     method
         As for `skeletonize`.
-    fixed
-        Pixels of the mask that thinning must not remove, shape ``(rows, cols)``: an earlier skeleton to grow.
 
     Returns
     -------
@@ -117,7 +123,7 @@ def skeletonize_windows(
     Raises
     ------
     InputError
-        If the mask does not have two dimensions, or ``out`` or ``fixed`` has another shape.
+        If the mask does not have two dimensions, or ``out`` has another shape.
     OptionError
         If the window or the halo is too small, or the method is unknown.
 
@@ -132,10 +138,9 @@ def skeletonize_windows(
         raise OptionError(f"window is {window} and halo is {halo}", fix="use at least 1 and 2 pixels")
     if out is None:
         out = np.zeros((rows, cols), bool)
-    for name, array in (("out", out), ("fixed", fixed)):
-        if array is not None and array.shape != (rows, cols):
-            raise InputError(f"{name} has shape {array.shape}, the mask {(rows, cols)}", fix="use the mask's shape")
-    while not _thin_windows(mask, fixed, out, window, halo, _deletion_table(method)):
+    if out.shape != (rows, cols):
+        raise InputError(f"out has shape {out.shape}, the mask {(rows, cols)}", fix="use the mask's shape")
+    while not _thin_windows(mask, out, window, halo, _deletion_table(method)):
         halo *= 2
         logger.info("the mask is wide: thinning again with a halo of %d pixels", halo)
     return out
@@ -160,14 +165,7 @@ def skeleton_pixels(skeleton: NDArray[Any], *, strip: int = 4096) -> tuple[NDArr
     return row, np.concatenate([part[1] for part in parts])
 
 
-def _thin_windows(
-    mask: NDArray[Any],
-    fixed: NDArray[Any] | None,
-    out: NDArray[np.bool_],
-    window: int,
-    halo: int,
-    table: NDArray[np.bool_],
-) -> bool:
+def _thin_windows(mask: NDArray[Any], out: NDArray[np.bool_], window: int, halo: int, table: NDArray[np.bool_]) -> bool:
     """Thin all windows; False where the halo proves too small for one of them."""
     rows, cols = mask.shape
     for top in range(0, rows, window):
@@ -178,8 +176,6 @@ def _thin_windows(
                 out[core] = False
                 continue
             state = _padded_state(mask, top, left, height, width, halo=halo)
-            if fixed is not None:
-                state |= _FIXED * _padded_state(fixed, top, left, height, width, halo=halo)
             if _thin(state, table, halo // 2, halo) >= halo // 2:
                 return False
             inner = state[halo + 1 : halo + 1 + height, halo + 1 : halo + 1 + width]
