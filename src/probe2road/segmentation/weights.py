@@ -1,0 +1,201 @@
+"""What a weights file is: one ONNX file that holds a network, and beside it what the network expects and promises.
+
+Strategy
+--------
+A file is the serialised ONNX model, followed by its metadata as one more field of the same message. Protocol buffer
+messages may be concatenated, so that any program for ONNX opens the file. It lets us read the metadata without a
+runtime, see at once that a file is cut off, and check a digest of everything before the metadata: a flipped bit in the
+weights would otherwise pass as slightly worse roads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from probe2road.errors import InputError, OptionError
+
+__all__ = ["FORMAT", "METADATA_KEY", "ModelInfo", "Weights", "metadata_text", "network_input", "read_weights"]
+
+FORMAT = 1  # raised when older versions of probe2road could not use a new file
+METADATA_KEY = "probe2road"
+
+_METADATA_FIELD = 14  # metadata_props in ONNX's ModelProto
+_TEXT = 2  # wire type of length-delimited fields, the only one that metadata has
+_FIXED_BYTES = {1: 8, 5: 4}  # of the wire types of fixed length
+_NOT_OURS = "use a file that probe2road train has exported, or --segmenter density"
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """What a network expects and promises, and where it comes from."""
+
+    name: str  # of the model, for reports
+    channels: tuple[str, ...]  # what it looks at, in its order; names of probe2road.raster.CHANNELS
+    network: dict[str, Any] = field(default_factory=dict)  # what the network is built from, for training
+    resolution: float = 1.0  # m per pixel
+    threshold: float = 0.5  # probability that continues a road
+    seed_threshold: float = 0.5  # probability that starts one
+    tile: int = 1024  # px, side of the tiles it is meant to see
+    stride: int = 32  # px; rows and columns of its input are multiples of it
+    training: dict[str, Any] = field(default_factory=dict)  # configuration, seed, steps, data, scores
+
+    def __post_init__(self) -> None:
+        """Refuse what no network can mean."""
+        if not self.channels or len(set(self.channels)) < len(self.channels):
+            raise OptionError(f"channels are {list(self.channels)}", where="ModelInfo", fix="name each one once")
+        if not self.resolution > 0:
+            raise OptionError(f"resolution is {self.resolution}", where="ModelInfo", fix="use metres per pixel above 0")
+        if self.stride < 1 or self.tile < self.stride or self.tile % self.stride:
+            raise OptionError(
+                f"a tile of {self.tile} px does not suit a stride of {self.stride} px",
+                where="ModelInfo",
+                fix="use a multiple of the stride",
+            )
+        if not 0 < self.threshold <= self.seed_threshold < 1:
+            raise OptionError(
+                f"threshold {self.threshold} and seed_threshold {self.seed_threshold} are not in order",
+                where="ModelInfo",
+                fix="use 0 < threshold <= seed_threshold < 1",
+            )
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A weights file in memory, found to be complete and ours."""
+
+    info: ModelInfo
+    model: bytes  # the whole file, an ONNX model
+    digest: str  # of everything but the metadata; equal for equal networks
+    path: Path
+
+
+def network_input(counts: ArrayLike) -> NDArray[np.float32]:
+    """Return what networks look at: log10(1 + count), of any shape.
+
+    Notes
+    -----
+    Paper, section III-A; METHOD 0.1 row 5.
+
+    Examples
+    --------
+    >>> network_input([0, 9, 99])
+    array([0., 1., 2.], dtype=float32)
+    """
+    return np.log10(1.0 + np.asarray(counts, np.float32), dtype=np.float32)
+
+
+def metadata_text(info: ModelInfo, model: bytes) -> str:
+    """Return the metadata to store with a serialised ONNX model that has none yet."""
+    return json.dumps({"format": FORMAT, "digest": _digest(model), **asdict(info)}, sort_keys=True)
+
+
+def read_weights(path: str | Path) -> Weights:
+    """Read a weights file and check that it is complete.
+
+    Parameters
+    ----------
+    path
+        Written by `probe2road.segmentation.export_onnx.export`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is cut off or damaged, is no weights file, or was written by a newer version
+        of probe2road in a way that this one does not know.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"weights cannot be read ({error.strerror})", where=path) from error
+    text, body = _metadata(data, path)
+    try:
+        table = json.loads(text)
+        version, digest = table.pop("format"), table.pop("digest")
+    except (ValueError, KeyError, AttributeError, TypeError) as error:
+        raise InputError("the metadata of the weights are damaged", where=path, fix=_NOT_OURS) from error
+    if version > FORMAT:
+        raise InputError(
+            f"weights of format {version}; this version reads up to {FORMAT}", where=path, fix="update probe2road"
+        )
+    if digest != _digest(data[:body]):
+        raise InputError("the weights are damaged: their checksum differs", where=path, fix="copy the file again")
+    return Weights(_info(table, path), data, digest, path)
+
+
+def _info(table: dict[str, Any], path: Path) -> ModelInfo:
+    """Return the metadata of one file; entries that a later version added without raising the format are left out."""
+    known = {field.name for field in fields(ModelInfo)}
+    try:
+        return ModelInfo(
+            **{name: value for name, value in table.items() if name in known} | {"channels": tuple(table["channels"])}
+        )
+    except (KeyError, TypeError, OptionError) as error:
+        raise InputError(f"the metadata of the weights make no sense ({error})", where=path, fix=_NOT_OURS) from error
+
+
+def _metadata(data: bytes, path: Path) -> tuple[str, int]:
+    """Return our metadata in a serialised ONNX model, and how many bytes stand before it."""
+    foreign = InputError("not a weights file of probe2road", where=path, fix=_NOT_OURS)
+    try:
+        for number, start, content in _fields(data):
+            if number == _METADATA_FIELD:
+                entry = {key: text for key, _, text in _fields(content)}
+                if entry.get(1) == METADATA_KEY.encode():
+                    return entry[2].decode(), start
+    except EOFError as error:
+        raise InputError("the weights are cut off, or no ONNX file", where=path, fix="copy the file again") from error
+    except (ValueError, KeyError) as error:
+        raise foreign from error
+    raise foreign
+
+
+def _fields(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Walk the fields of a protocol buffer message: number, first byte, content (empty unless length-delimited).
+
+    Raises EOFError where the message ends inside a field, and ValueError where it is no message.
+    """
+    place = 0
+    while place < len(data):
+        start = place
+        key, place = _varint(data, place)
+        wire_type, content = key & 7, b""
+        if wire_type == 0:
+            _, place = _varint(data, place)
+        elif wire_type == _TEXT:
+            length, place = _varint(data, place)
+            content = data[place : place + length]
+            place += length
+        elif wire_type in _FIXED_BYTES:
+            place += _FIXED_BYTES[wire_type]
+        else:
+            raise ValueError(f"wire type {wire_type}")
+        if place > len(data):
+            raise EOFError
+        yield key >> 3, start, content
+
+
+def _varint(data: bytes, place: int) -> tuple[int, int]:
+    """Return a number in base 128, lowest digits first, and the place after it."""
+    value = shift = 0
+    while shift < 64:
+        if place >= len(data):
+            raise EOFError
+        value |= (data[place] & 127) << shift
+        place += 1
+        if data[place - 1] < 128:
+            return value, place
+        shift += 7
+    raise ValueError("a number of more than 64 bits")
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
