@@ -26,7 +26,7 @@ from probe2road.osrm import OsrmOptions, osrm_network, osrm_segments, osrm_serve
 from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
 from probe2road.splitting import split_edges
 
-__all__ = ["MATCHERS", "LabelOptions", "cut_reference", "label_mask", "label_reference"]
+__all__ = ["MATCHERS", "LabelOptions", "cut_reference", "draw_lines", "label_mask", "label_pieces", "label_reference"]
 
 logger = logging.getLogger(__name__)
 
@@ -102,6 +102,39 @@ def label_reference(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions
     [[0, 80.0, 4], [0, 80.0, 4]]
     """
     options = options or LabelOptions()
+    pieces, driven = label_pieces(reference, fleet, options)
+    length = pieces.edges["length"].to_numpy()
+    support = np.bincount(pieces.edges.index.get_indexer(driven["edge"]), minlength=len(length))
+    kept = support >= options.min_traces
+    edges = pieces.edges.assign(support=pd.array(support, "Int64"))[kept]
+    nodes = pieces.nodes[pieces.nodes.index.isin(np.unique(edges[["u", "v"]]))]
+    logger.info(
+        "kept %.1f of %.1f km: pieces that at least %d traces drive (%s)",
+        length[kept].sum() / 1000, length.sum() / 1000, options.min_traces, options.matcher,
+    )  # fmt: skip
+    return replace(pieces, nodes=nodes, edges=finish_edges(edges), turns=empty_turns())
+
+
+def label_pieces(reference: RoadGraph, fleet: Fleet, options: LabelOptions) -> tuple[RoadGraph, pd.DataFrame]:
+    """Cut a reference and list which trace drives which piece.
+
+    Parameters
+    ----------
+    reference, fleet, options
+        As for `label_reference`; the minimum number of traces is not looked at.
+
+    Returns
+    -------
+    RoadGraph
+        The pieces, see `cut_reference`.
+    DataFrame
+        ``trace_id``, ``edge`` (id of the piece): each pair once.
+
+    Raises
+    ------
+    CRSError, MissingExtraError, InputError
+        As `label_reference`.
+    """
     if not same_crs(fleet.crs, reference.crs):
         fault = f"the traces are in {fleet.crs.name}, the reference is in {reference.crs.name}"
         raise CRSError(fault, where="label_reference", fix="reproject one of them, for example with graph.to_crs")
@@ -111,15 +144,10 @@ def label_reference(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions
     covered = table.groupby(["trace", "edge"])["length"].sum().reset_index()
     length = pieces.edges["length"].to_numpy()
     driven = covered[covered["length"].to_numpy() >= options.min_share * length[covered["edge"]]]
-    support = np.bincount(driven["edge"], minlength=len(length))
-    kept = support >= options.min_traces
-    edges = pieces.edges.assign(support=pd.array(support, "Int64"))[kept]
-    nodes = pieces.nodes[pieces.nodes.index.isin(np.unique(edges[["u", "v"]]))]
-    logger.info(
-        "kept %.1f of %.1f km: pieces that at least %d traces drive (%s)",
-        length[kept].sum() / 1000, length.sum() / 1000, options.min_traces, options.matcher,
-    )  # fmt: skip
-    return replace(pieces, nodes=nodes, edges=finish_edges(edges), turns=empty_turns())
+    ids = fleet.traces["trace_id"].to_numpy()[fleet.starts[:-1]]
+    return pieces, pd.DataFrame(
+        {"trace_id": ids[driven["trace"]], "edge": pieces.edges.index.to_numpy()[driven["edge"]]}
+    )
 
 
 def cut_reference(reference: RoadGraph, *, max_piece: float = 100.0) -> RoadGraph:
@@ -183,11 +211,49 @@ def label_mask(graph: RoadGraph, grid: Grid, *, width: int = 1) -> NDArray[np.ui
     if not same_crs(graph.crs, grid.crs):
         fault = f"the graph is in {graph.crs.name}, the grid is in {grid.crs.name}"
         raise CRSError(fault, where="label_mask", fix="use graph.to_crs")
-    if width < 1:
-        raise OptionError(f"width is {width}", where="label_mask", fix="use 1 pixel or more")
     xy, owner = shapely.get_coordinates(graph.edges.geometry.to_numpy(), return_index=True)
-    row, col = grid.rowcol(xy[:, 0], xy[:, 1])
-    mask = np.zeros(grid.shape, np.uint8)
+    return draw_lines(*grid.rowcol(xy[:, 0], xy[:, 1]), owner, grid.shape, width=width)
+
+
+def draw_lines(
+    row: NDArray[np.int64],
+    col: NDArray[np.int64],
+    owner: NDArray[np.int64],
+    shape: tuple[int, int],
+    *,
+    width: int = 1,
+) -> NDArray[np.uint8]:
+    """Draw lines that are in pixel coordinates already; see `label_mask`.
+
+    Parameters
+    ----------
+    row, col
+        Pixels of v vertices; they may lie outside.
+    owner
+        Line of each vertex, shape ``(v,)``; the vertices of a line follow each other.
+    shape
+        ``(rows, cols)`` of the mask.
+    width
+        Pixels.
+
+    Returns
+    -------
+    ndarray of uint8, shape (rows, cols)
+
+    Raises
+    ------
+    OptionError
+        If the width is below 1.
+
+    Examples
+    --------
+    >>> draw_lines(np.array([0, 0]), np.array([1, 3]), np.array([5, 5]), (2, 4), width=2)
+    array([[1, 1, 1, 1],
+           [0, 0, 0, 0]], dtype=uint8)
+    """
+    if width < 1:
+        raise OptionError(f"width is {width}", where="draw_lines", fix="use 1 pixel or more")
+    mask = np.zeros(shape, np.uint8)
     _draw(row, col, owner.astype(np.int64), width // 2, (width - 1) // 2, mask)
     return mask
 

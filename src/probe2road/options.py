@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from probe2road.errors import OptionError
 
@@ -67,7 +67,16 @@ def _replaced(defaults: Any, table: dict[str, Any], where: object) -> Any:
 
 
 def _converted(value: Any, hint: Any, where: str) -> Any:
-    """Return the value as its field wants it: whole numbers become floats."""
+    """Return the value as its field wants it: whole numbers become floats, lists become tuples, tables dataclasses."""
+    if get_origin(hint) is tuple and isinstance(value, list):
+        kinds = get_args(hint)
+        if kinds[-1] is not Ellipsis and len(value) != len(kinds):
+            raise OptionError(f"has {len(value)} values, not {len(kinds)}", where=where)
+        kinds = kinds[:1] * len(value) if kinds[-1] is Ellipsis else kinds
+        return tuple(_converted(*pair, f"{where}[{n}]") for n, pair in enumerate(zip(value, kinds, strict=True)))
+    if is_dataclass(hint) and isinstance(value, dict):
+        defaults: Any = hint
+        return _replaced(defaults(), value, where)
     allowed = get_args(hint) or (hint,)
     if float in allowed and type(value) is int:
         return float(value)

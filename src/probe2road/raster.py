@@ -24,6 +24,7 @@ from probe2road.grid import Grid, Window
 __all__ = [
     "CHANNELS",
     "Grid",
+    "count_pixels",
     "fleet_grid",
     "rasterize",
     "rasterize_windows",
@@ -137,6 +138,46 @@ def rasterize_windows(
         _draw_segments(row, col, breaks, own_fixes, top, left, counts[0])
         _count_points(point_row[own_points] - top, point_col[own_points] - left, channel[own_points], counts)
         yield window, counts
+
+
+def count_pixels(
+    row: NDArray[np.int64],
+    col: NDArray[np.int64],
+    breaks: NDArray[np.bool_],
+    point_row: NDArray[np.int64],
+    point_col: NDArray[np.int64],
+    kind: NDArray[np.int64],
+    shape: tuple[int, int],
+) -> NDArray[np.uint32]:
+    """Count traces and points that are in pixel coordinates already; see `rasterize`.
+
+    Parameters
+    ----------
+    row, col
+        Pixels of f fixes, in driving order; they may lie outside.
+    breaks
+        True where no segment leads from the fix before; shape ``(f,)``.
+    point_row, point_col, kind
+        Pixels of p points, and their positions in `probe2road.fleet.POINT_KINDS`.
+    shape
+        ``(rows, cols)`` of the raster.
+
+    Returns
+    -------
+    ndarray of uint32, shape (3, rows, cols)
+
+    Examples
+    --------
+    >>> none = np.zeros(0, np.int64)
+    >>> breaks = np.array([True, False])
+    >>> count_pixels(np.array([1, 1]), np.array([0, 2]), breaks, none, none, none, (2, 4))[0]
+    array([[0, 0, 0, 0],
+           [1, 1, 1, 0]], dtype=uint32)
+    """
+    counts = np.zeros((len(CHANNELS), *shape), np.uint32)
+    _draw_segments(row, col, breaks, np.arange(len(row)), 0, 0, counts[0])
+    _count_points(point_row, point_col, kind + 1, counts)  # the channels follow POINT_KINDS
+    return counts
 
 
 @njit(cache=True)

@@ -83,7 +83,7 @@ _CORRIDORS = tuple(Dataset(f"corridor-{n}", _TRAIN, f"generate:corridor:{n}", 1_
 _TOWNS = tuple(
     Dataset(f"{kind}-{seed}", _TRAIN, f"generate:{kind}:{seed}", 500.0, 300 + seed)
     for kind in ("town", "old_town")
-    for seed in (1, 2)
+    for seed in (1, 2, 3, 4)
 )
 
 DATASETS: Mapping[str, Dataset] = {data.name: data for data in (*_CITIES, *_INTERCHANGES, *_CORRIDORS, *_TOWNS)}

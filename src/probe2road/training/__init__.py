@@ -1,0 +1,1 @@
+"""Training the segmentation network: scenes, samples, configuration, the loop, and what decides its checkpoint."""

@@ -1,0 +1,78 @@
+"""From the best weights of a run to a weights file: threshold chosen on the validation squares, story told."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict
+from pathlib import Path
+
+from probe2road.errors import InputError, needs_extra
+from probe2road.segmentation.dlinknet import STRIDE
+from probe2road.segmentation.export_onnx import export
+from probe2road.segmentation.weights import ModelInfo
+from probe2road.training.config import TrainConfig
+from probe2road.training.loop import predict_squares
+from probe2road.training.state import BEST, TrainingState, build_network
+from probe2road.training.validation import validate, validation_squares
+
+with needs_extra("train", feature="training the segmentation network"):
+    import torch
+
+__all__ = ["THRESHOLDS", "export_best"]
+
+logger = logging.getLogger(__name__)
+
+THRESHOLDS = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
+
+
+def export_best(config: TrainConfig, state: TrainingState, output: str | Path, *, sets: str | Path) -> Path:
+    """Write the best weights of a run as a weights file that `probe2road build` takes.
+
+    Of `THRESHOLDS` the one with the best validation score becomes the model's own (METHOD 0.1 row 12).
+
+    Parameters
+    ----------
+    config
+        Of the run.
+    state
+        Where it ended.
+    output
+        Folder of the run; gets ``NAME.onnx``.
+    sets
+        Folder of prepared data sets.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    InputError
+        If the run was never validated, so that no weights are the best.
+    """
+    path = Path(output) / BEST
+    if not path.exists():
+        raise InputError("there are no weights yet", where=path, fix="train at least to the first validation")
+    network = build_network(config)
+    network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
+    squares = validation_squares(config.validation, config.sample, sets)
+    probabilities = predict_squares(network, config, squares)
+    sweep = [{"threshold": at, **validate(squares, probabilities, threshold=at)} for at in THRESHOLDS]
+    chosen = max(sweep, key=lambda row: row["score"])
+    logger.info(
+        "threshold %.1f: soft F1 %.3f, GEO F1 %.3f", *(chosen[name] for name in ("threshold", "soft_f1", "geo_f1"))
+    )
+    kept = max(state.curve, key=lambda row: row["score"])
+    info = ModelInfo(
+        name=config.name,
+        channels=config.channels,
+        network={"architecture": config.architecture},
+        threshold=chosen["threshold"],
+        seed_threshold=chosen["threshold"],
+        stride=STRIDE,
+        training={"config": asdict(config), "step": kept["step"], "validation": kept, "thresholds": sweep},
+    )
+    file = Path(output) / f"{config.name}.onnx"
+    export(network, info, file)
+    return file

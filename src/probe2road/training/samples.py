@@ -1,0 +1,229 @@
+"""Samples: squares of a scene, turned, thinned and disturbed at random, as count rasters with their labels.
+
+Everything happens to the vectors before they are drawn, so that a sample has what real rasters have: lines one
+pixel wide at any angle, and counts that are whole. Drives are left out before edges are counted, so that the
+label of a thinned sample is what enough of the remaining drives passed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from probe2road.benchmark.tiles import TILE_SIZE
+from probe2road.errors import OptionError
+from probe2road.labels import draw_lines
+from probe2road.raster import count_pixels
+from probe2road.training.scene import Scene, rows_around
+
+__all__ = ["Sample", "SampleOptions", "draw_sample", "square"]
+
+_ROTATIONS = ("none", "right_angles", "any")
+
+
+@dataclass(frozen=True)
+class SampleOptions:
+    """What a sample is, and how it is varied."""
+
+    size: int = 384  # pixels of 1 m
+    min_drives: int = 4  # distinct drives that make an edge a label; the N of the paper
+    label_width: int = 3  # pixels
+    rotation: str = "any"  # one of "none", "right_angles", "any"
+    flip: bool = True  # whether half of the samples are mirrored
+    busy_share: float = 0.5  # of the samples, centred near junctions and crossings
+    jitter: float = 0.3  # of the size, by which a centre lies beside the road
+    tiles: bool = False  # whether centres are those of the tiles of the benchmark, each as likely, instead
+    all_drives_share: float = 0.4  # of the samples, with all drives
+    least_drives: float = 0.05  # share of the drives that the thinnest sample keeps
+    intervals: tuple[float, ...] = (0.0,)  # s between fixes, one is drawn; 0 keeps all
+    offsets: tuple[float, ...] = (0.0,)  # m, 1 sigma of a shift of each drive, one is drawn; traces and points alike
+    least_points: float = 0.3  # share of the semantic points that the poorest sample keeps
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be drawn."""
+        if self.rotation not in _ROTATIONS:
+            fix = f"use one of {', '.join(_ROTATIONS)}"
+            raise OptionError(f"there is no rotation {self.rotation!r}", where="SampleOptions", fix=fix)
+        shares = ("busy_share", "jitter", "all_drives_share", "least_drives", "least_points")
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.name in shares and not 0 <= value <= 1:
+                raise OptionError(f"{entry.name} is {value}", where="SampleOptions", fix="use 0 to 1")
+        if self.size < 32 or self.label_width < 1 or not self.intervals or not self.offsets:
+            fix = "use a size from 32, a label width from 1, and at least one interval and one offset"
+            raise OptionError("a sample cannot be drawn", where="SampleOptions", fix=fix)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Input and answer."""
+
+    counts: NDArray[np.uint32]  # (3, size, size)
+    label: NDArray[np.uint8]  # (size, size), 1 on a centreline
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """Where a sample lies: pixel = offset + turn @ (place - centre)."""
+
+    centre: tuple[float, float]  # m from the scene's origin
+    turn: NDArray[np.float64]  # (2, 2): place to (column, row)
+    size: int
+
+    def pixels(self, xy: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns of places ``(n, 2)``."""
+        moved = (xy - np.asarray(self.centre)) @ self.turn.T + self.size / 2
+        col, row = np.floor(moved).astype(np.int64).T
+        return np.ascontiguousarray(row), np.ascontiguousarray(col)
+
+
+def draw_sample(scene: Scene, rng: np.random.Generator, options: SampleOptions) -> Sample:
+    """Draw a sample at random.
+
+    Parameters
+    ----------
+    scene
+        Where from.
+    rng
+        Decides everything that is random.
+    options
+        How.
+
+    Returns
+    -------
+    Sample
+    """
+    frame = _Frame(_centre(scene, rng, options), _turn(rng, options), options.size)
+    kept = _kept_drives(scene, rng, options)
+    offset = rng.normal(0.0, rng.choice(options.offsets), (scene.n_drives, 2)).astype(np.float32)
+    interval = float(rng.choice(options.intervals))
+    points = rng.uniform(options.least_points, 1.0)
+    return _drawn(scene, frame, kept, options, offset=offset, interval=interval, points=points, rng=rng)
+
+
+def square(scene: Scene, centre: tuple[float, float], options: SampleOptions) -> Sample:
+    """Draw the square around a place as it is: north up, all drives, nothing disturbed.
+
+    Parameters
+    ----------
+    scene
+        Where from.
+    centre
+        ``(x, y)`` in metres from the scene's origin.
+    options
+        Of which only ``size``, ``min_drives`` and ``label_width`` are used.
+    """
+    frame = _Frame(centre, _TURNS[0], options.size)
+    kept = np.ones(scene.n_drives, bool)
+    offset = np.zeros((scene.n_drives, 2), np.float32)
+    return _drawn(scene, frame, kept, options, offset=offset, interval=0.0, points=1.0, rng=np.random.default_rng(0))
+
+
+_TURNS = np.array(
+    [[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]], [[-1.0, 0.0], [0.0, 1.0]], [[0.0, -1.0], [-1.0, 0.0]]]
+)
+
+
+def _turn(rng: np.random.Generator, options: SampleOptions) -> NDArray[np.float64]:
+    """Turn places into columns and rows, by any angle or by a right one, perhaps mirrored."""
+    if options.rotation == "any":
+        angle = rng.uniform(0.0, 2 * np.pi)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [-np.sin(angle), -np.cos(angle)]])
+    else:
+        turn = _TURNS[rng.integers(4) if options.rotation == "right_angles" else 0].copy()
+    if options.flip and rng.random() < 0.5:
+        turn[0] = -turn[0]
+    return turn
+
+
+def _centre(scene: Scene, rng: np.random.Generator, options: SampleOptions) -> tuple[float, float]:
+    """Choose a place beside a road, or a tile with a road in it."""
+    if options.tiles:
+        tile = rng.choice(np.unique(np.floor((scene.spots + scene.origin) / TILE_SIZE), axis=0))
+        x, y = (tile + 0.5) * TILE_SIZE - scene.origin
+        return float(x), float(y)
+    busy = np.flatnonzero(scene.spot_busy) if rng.random() < options.busy_share else np.zeros(0, np.int64)
+    spot = int(rng.choice(busy)) if len(busy) else int(rng.integers(len(scene.spots)))
+    aside = rng.uniform(-0.5, 0.5, 2) * options.jitter * options.size
+    return float(scene.spots[spot, 0] + aside[0]), float(scene.spots[spot, 1] + aside[1])
+
+
+def _kept_drives(scene: Scene, rng: np.random.Generator, options: SampleOptions) -> NDArray[np.bool_]:
+    """Leave drives out, in a share that is uniform on a logarithmic scale: shape ``(n_drives,)``."""
+    if rng.random() < options.all_drives_share or options.least_drives == 1.0:
+        return np.ones(scene.n_drives, bool)
+    share = np.exp(rng.uniform(np.log(max(options.least_drives, 1e-3)), 0.0))
+    return rng.random(scene.n_drives) < share
+
+
+def _drawn(
+    scene: Scene,
+    frame: _Frame,
+    kept: NDArray[np.bool_],
+    options: SampleOptions,
+    *,
+    offset: NDArray[np.float32],
+    interval: float,
+    points: float,
+    rng: np.random.Generator,
+) -> Sample:
+    """Draw what the kept drives recorded, each moved by its offset, and the edges that enough of them passed."""
+    reach = options.size * 0.75 + 4 * float(np.abs(offset).max(initial=0.0)) + _SEGMENT
+    fixes = np.sort(scene.fix_rows[rows_around(scene.fix_cells, scene.table, frame.centre, reach)])
+    fixes = fixes[kept[scene.fix_drive[fixes]]]
+    drive, time = scene.fix_drive[fixes], scene.fix_time[fixes]
+    phase = rng.random(len(kept)).astype(np.float32)
+    chosen = _sampled(drive, time, interval, phase)
+    fixes, drive, time = fixes[chosen], drive[chosen], time[chosen]
+    xy = scene.fix_xyz[fixes, :2] + offset[drive]
+    breaks = _breaks(drive, time, xy, max(_LATE, 3 * interval))
+    row, col = frame.pixels(xy)
+    seen = rows_around(scene.point_cells, scene.table, frame.centre, reach)
+    seen = seen[kept[scene.point_drive[seen]] & (rng.random(len(seen)) < points)]
+    point_row, point_col = frame.pixels(scene.point_xy[seen] + offset[scene.point_drive[seen]])
+    kind = scene.point_kind[seen].astype(np.int64)
+    counts = count_pixels(row, col, breaks, point_row, point_col, kind, (options.size, options.size))
+    return Sample(counts, _label(scene, frame, kept, options))
+
+
+def _label(scene: Scene, frame: _Frame, kept: NDArray[np.bool_], options: SampleOptions) -> NDArray[np.uint8]:
+    """Draw the edges that at least ``min_drives`` of the kept drives passed."""
+    total = np.concatenate([[0], np.cumsum(kept[scene.edge_drives])])
+    support = total[scene.edge_starts[1:]] - total[scene.edge_starts[:-1]]
+    vertices = np.flatnonzero((support >= options.min_drives)[scene.vertex_edge])
+    row, col = frame.pixels(scene.vertex_xy[vertices])
+    owner = scene.vertex_edge[vertices].astype(np.int64)
+    return draw_lines(row, col, owner, (options.size, options.size), width=options.label_width)
+
+
+_SEGMENT = 150.0  # m; a longer step is no segment (`probe2road.fleet.TraceGaps.max_step`)
+_LATE = 5.0  # s; a gap (`probe2road.fleet.TraceGaps.max_interval`)
+
+
+@njit(cache=True)
+def _sampled(
+    drive: NDArray[np.int32], time: NDArray[np.float32], interval: float, phase: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Keep the first fix of each drive in every interval, whose beginning is random for each drive."""
+    chosen = np.ones(len(drive), np.bool_)
+    if interval <= 0.0:
+        return chosen
+    for i in range(1, len(drive)):
+        if drive[i] == drive[i - 1]:
+            now = np.floor(time[i] / interval + phase[drive[i]])
+            chosen[i] = now != np.floor(time[i - 1] / interval + phase[drive[i]])
+    return chosen
+
+
+def _breaks(
+    drive: NDArray[np.int32], time: NDArray[np.float32], xy: NDArray[np.float32], late: float
+) -> NDArray[np.bool_]:
+    """Mark fixes that no segment reaches from the fix before: another drive, a gap in time, or too long a step."""
+    breaks = np.ones(len(drive), bool)
+    step = np.hypot(*np.diff(xy, axis=0).T)
+    limit = max(_SEGMENT, late / 3 * 40.0)
+    breaks[1:] = (np.diff(drive) != 0) | (np.diff(time) > late) | (step > limit)
+    return breaks

@@ -1,0 +1,158 @@
+"""Where scenes come from: data sets of the benchmark, or fleet data with a reference of one's own."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import shapely
+
+from probe2road.benchmark.datasets import find_datasets
+from probe2road.benchmark.prepare import read_tiles
+from probe2road.benchmark.recording import Recording
+from probe2road.benchmark.reference import labelled_reference
+from probe2road.benchmark.tiles import split_area
+from probe2road.errors import InputError, OptionError
+from probe2road.export import read_graph
+from probe2road.io.fleet_reader import read_fleet
+from probe2road.io.fleet_writer import points_path
+from probe2road.labels import LabelOptions, label_pieces
+from probe2road.roadgraph import RoadGraph
+from probe2road.training.scene import Scene, load_scene, make_scene, save_scene
+
+__all__ = ["Source", "driven_reference", "members", "open_scene"]
+
+logger = logging.getLogger(__name__)
+
+_SCENES = "scenes"  # folder of the laid-out scenes, beside the data sets
+
+
+@dataclass(frozen=True)
+class Source:
+    """Fleet data and the roads it was recorded on: either a data set of the benchmark, or files."""
+
+    name: str = "columbus"  # of a data set or a group of the benchmark, or what to call your own
+    split: str = ""  # of the data set; all of it where empty
+    data: str = "aligned"  # "aligned" or "raw", of a data set
+    fleet: str = ""  # fleet data of your own, read by `probe2road.read_fleet`
+    points: str = ""  # its semantic points, where they are another file
+    reference: str = ""  # centrelines of your own, a graph file
+    weight: float = 1.0  # how often it is drawn, against the other sources
+
+    def __post_init__(self) -> None:
+        """Refuse a source of nothing, or of two things."""
+        if self.name == "" or bool(self.fleet) != bool(self.reference):
+            fix = "give the name of a data set, or a name, a fleet and a reference"
+            raise OptionError("names nothing to learn from", where="source", fix=fix)
+        if self.data not in ("aligned", "raw") or self.weight < 0:
+            fix = "use aligned or raw, and a weight of 0 or more"
+            raise OptionError(f"data is {self.data!r}, weight is {self.weight}", where=f"source {self.name}", fix=fix)
+
+
+def members(sources: Sequence[Source]) -> list[Source]:
+    """Replace groups of data sets by their members, which share the weight.
+
+    Raises
+    ------
+    OptionError
+        If there is no data set of a name.
+
+    Examples
+    --------
+    >>> [(source.name, source.weight) for source in members([Source("town-1"), Source("corridors", data="raw")])][:2]
+    [('town-1', 1.0), ('corridor-1', 0.25)]
+    """
+    single = []
+    for source in sources:
+        names = [source.name] if source.fleet else [data.name for data in find_datasets([source.name])]
+        single += [replace(source, name=name, weight=source.weight / len(names)) for name in names]
+    return single
+
+
+def open_scene(source: Source, sets: str | Path) -> Scene:
+    """Return the scene of a source, laid out beside the data sets the first time it is asked for.
+
+    Parameters
+    ----------
+    source
+        Where from.
+    sets
+        Folder of the prepared data sets; scenes are kept in ``scenes`` in it.
+
+    Returns
+    -------
+    Scene
+        Mapped into memory.
+
+    Raises
+    ------
+    InputError
+        If the data set is not there, or a file cannot be read.
+    """
+    label = "-".join(part for part in (source.name, source.split, source.data) if part)
+    folder = Path(sets) / _SCENES / label
+    about = {**asdict(replace(source, weight=1.0)), "changed": [_changed(path) for path in _files(source, sets)]}
+    if (scene := load_scene(folder, about=about)) is None:
+        logger.info("laying out scene %s", label)
+        save_scene(_make(source, Path(sets)), folder, about=about)
+        scene = load_scene(folder, about=about)
+        assert scene is not None
+    return scene
+
+
+def driven_reference(source: Source, sets: str | Path, *, min_drives: int) -> tuple[RoadGraph, shapely.Geometry | None]:
+    """Return the edges of a data set that enough drives passed, and the area of its split (None for all of it).
+
+    Raises
+    ------
+    OptionError
+        If the source is no data set.
+    """
+    if source.fleet:
+        fix = "validate on a data set of the benchmark"
+        raise OptionError(f"source {source.name} is no data set", where="validation", fix=fix)
+    recording = _recording(source, sets)
+    area = split_area(read_tiles(recording.folder), source.split) if source.split else None
+    return labelled_reference(read_graph(recording.reference), min_drives=min_drives), area
+
+
+def _make(source: Source, sets: Path) -> Scene:
+    """Lay a source out."""
+    if source.fleet:
+        fleet = read_fleet(source.fleet, source.points or None)
+        pieces, driven = label_pieces(read_graph(source.reference).to_crs(fleet.crs), fleet, LabelOptions())
+        return make_scene(fleet, pieces, driven)
+    recording = _recording(source, sets)
+    path = recording.aligned if source.data == "aligned" else recording.drives
+    points = points_path(path)
+    fleet = read_fleet(path, points if points.exists() else None)
+    driven = pd.read_parquet(recording.routes).rename(columns={"section": "edge"})
+    area = split_area(read_tiles(recording.folder), source.split) if source.split else None
+    return make_scene(fleet, read_graph(recording.reference), driven, area=area)
+
+
+def _recording(source: Source, sets: str | Path) -> Recording:
+    """Return the recording of a data set that is there."""
+    recording = Recording(Path(sets) / source.name)
+    if not recording.reference.exists():
+        fix = f"run probe2road benchmark prepare {source.name} --output {sets}"
+        raise InputError("there is no such data set", where=recording.folder, fix=fix)
+    return recording
+
+
+def _files(source: Source, sets: str | Path) -> list[Path]:
+    """List the files that decide whether a scene is still that of its source."""
+    if source.fleet:
+        return [Path(path) for path in (source.fleet, source.points, source.reference) if path]
+    return [_recording(source, sets).folder / "manifest.json"]
+
+
+def _changed(path: Path) -> int:
+    """When a file was changed, ns."""
+    if not path.exists():
+        raise InputError("is missing", where=path)
+    return int(np.int64(path.stat().st_mtime_ns))

@@ -1,0 +1,127 @@
+"""What chooses the checkpoint: soft F1 of the masks and GEO F1 of the graphs drawn from them, on fixed squares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+
+from probe2road.clean import clean_graph
+from probe2road.errors import InputError
+from probe2road.grid import Grid
+from probe2road.metrics.geo import geo
+from probe2road.metrics.normalise import clip_graph
+from probe2road.metrics.scores import Score
+from probe2road.metrics.soft_f1 import soft_f1
+from probe2road.roadgraph import RoadGraph
+from probe2road.segmentation.mask import threshold_mask
+from probe2road.skeleton import skeletonize
+from probe2road.training.config import ValidationOptions
+from probe2road.training.samples import SampleOptions, square
+from probe2road.training.scene import Scene
+from probe2road.training.sources import driven_reference, open_scene
+from probe2road.vectorize import vectorize
+
+__all__ = ["Square", "validate", "validation_squares"]
+
+
+@dataclass(frozen=True)
+class Square:
+    """A square to validate on."""
+
+    counts: NDArray[np.uint32]  # (3, size, size)
+    label: NDArray[np.uint8]  # (size, size)
+    reference: RoadGraph  # driven edges, clipped to the square
+    grid: Grid
+
+
+def validation_squares(options: ValidationOptions, sample: SampleOptions, sets: str | Path) -> list[Square]:
+    """Draw the squares: of each source, evenly spread from those with the most to those with the least road.
+
+    Parameters
+    ----------
+    options
+        Which, and how many.
+    sample
+        What a label is.
+    sets
+        Folder of the data sets.
+
+    Raises
+    ------
+    InputError
+        If a data set is missing.
+    OptionError
+        If a source is no data set.
+    """
+    squares = []
+    drawn = replace(sample, size=options.size)
+    for source in options.sources:
+        scene = open_scene(source, sets)
+        reference, _ = driven_reference(source, sets, min_drives=sample.min_drives)
+        for centre in _places(scene, options):
+            x, y = (np.floor(scene.origin + centre)).tolist()
+            half = options.size / 2
+            grid = Grid(x - half, y + half, 1.0, options.size, options.size, reference.crs)
+            found = square(scene, (x - scene.origin[0], y - scene.origin[1]), drawn)
+            squares.append(Square(found.counts, found.label, clip_graph(reference, shapely.box(*grid.bounds)), grid))
+    return squares
+
+
+def validate(
+    squares: Sequence[Square], probabilities: Sequence[NDArray[np.float32]], *, threshold: float = 0.5
+) -> dict[str, float]:
+    """Score predictions on the squares, pooled over all.
+
+    Parameters
+    ----------
+    squares
+        From `validation_squares`.
+    probabilities
+        Of each square, shape ``(size, size)``.
+    threshold
+        From which a pixel is road.
+
+    Returns
+    -------
+    dict
+        ``soft_f1``, ``geo_f1``, ``geo_precision``, ``geo_recall``, and ``score``, the mean of the two F1, which
+        chooses the checkpoint: a loss cannot (METHOD 2.4).
+
+    Raises
+    ------
+    InputError
+        If there are no squares.
+    """
+    if not squares:
+        raise InputError("there are no squares to validate on", where="validation", fix="name a source with roads")
+    masks = [threshold_mask(probability, threshold=threshold) for probability in probabilities]
+    soft = soft_f1(masks, [part.label for part in squares])
+    graphs = [clean_graph(vectorize(skeletonize(mask), part.grid)) for mask, part in zip(masks, squares, strict=True)]
+    place = _pooled([geo(graph, part.reference) for graph, part in zip(graphs, squares, strict=True)])
+    return {
+        "score": (soft.f1 + place.f1) / 2, "soft_f1": soft.f1,
+        "geo_f1": place.f1, "geo_precision": place.precision, "geo_recall": place.recall,
+    }  # fmt: skip
+
+
+def _places(scene: Scene, options: ValidationOptions) -> NDArray[np.float64]:
+    """Centres of squares of a regular table that hold road: shape ``(n, 2)``, m from the scene's origin."""
+    table = pd.DataFrame(np.floor(scene.spots / options.size).astype(np.int64), columns=["col", "row"])
+    road = table.value_counts(sort=True)
+    road = road[road >= min(30, road.max())]  # 300 m
+    chosen = np.unique(np.linspace(0, len(road) - 1, options.squares).round().astype(np.int64))
+    places = np.array(sorted(road.index.to_list(), key=lambda place: (-road[place], place)))[chosen]
+    return (places + 0.5) * options.size
+
+
+def _pooled(scores: Sequence[Score]) -> Score:
+    """Add up the counts of several scores of one metric."""
+    names = ("matched_proposal", "proposal", "matched_reference", "reference")
+    counts = {name: sum(getattr(score, name) for score in scores) for name in names}
+    return Score.from_counts(scores[0].metric, **counts, parameters=scores[0].parameters)
