@@ -4,7 +4,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints-cpu.txt
 
 # One thread per test worker: two workers on two cores gain nothing from more, and numba's threads would fight.
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1
@@ -47,17 +47,17 @@ format: $(VENV)/.dev-installed
 clean:
 	rm -rf $(VENV) site demo-output .mypy_cache .pytest_cache .ruff_cache .hypothesis
 
-# The stamps say what the environment holds; both are redone when pyproject.toml changes.
+# The stamps say what the environment holds; both are redone when pyproject.toml or the constraints change.
 $(VENV)/.created:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo 'probe2road needs Python 3.11 or later; name one, for example: make $(MAKECMDGOALS) PYTHON=python3.12'; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	@touch $@
 
-$(VENV)/.core-installed: pyproject.toml | $(VENV)/.created
+$(VENV)/.core-installed: pyproject.toml constraints-cpu.txt | $(VENV)/.created
 	$(PIP) --editable .
 	@touch $@
 
-$(VENV)/.dev-installed: pyproject.toml | $(VENV)/.created
+$(VENV)/.dev-installed: pyproject.toml constraints-cpu.txt | $(VENV)/.created
 	$(PIP) --editable '.[dev]'
 	@touch $(VENV)/.core-installed $@

@@ -79,7 +79,7 @@ def test_every_stage_is_kept_on_request(crossing, tmp_path):
 def test_an_interrupted_run_goes_on_where_it_stopped(crossing, tmp_path, monkeypatch):
     options = BuildOptions(density=DensityOptions(bandwidth=4.5))
     whole = build(crossing, options)
-    monkeypatch.setattr("probe2road.recipe._WINDOW", 256)
+    monkeypatch.setattr("probe2road.segmentation.density._WINDOW", 256)
     windows = []
 
     def counting(counts, grid, options):
@@ -92,11 +92,11 @@ def test_an_interrupted_run_goes_on_where_it_stopped(crossing, tmp_path, monkeyp
     monkeypatch.setattr("probe2road.segmentation.density.density_probability", counting)
     with pytest.raises(KeyboardInterrupt):
         build(crossing, options, workspace=tmp_path / "work")
-    assert len(list((tmp_path / "work").glob("window-*.npy"))) == 3
+    assert len(list((tmp_path / "work").glob("window-*.npz"))) == 3
     graph = build(crossing, options, workspace=tmp_path / "work")
     windows.remove("stop")
     assert len(windows) == len(set(windows)) > 3  # none was done twice
-    assert not list((tmp_path / "work").glob("window-*.npy"))
+    assert not list((tmp_path / "work").glob("window-*.npz"))
     assert graph.edges.geometry.geom_equals_exact(whole.edges.geometry, 1e-6).all()
 
 

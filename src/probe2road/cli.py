@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from probe2road.fleet import Fleet
     from probe2road.recipe import Progress
+    from probe2road.segmentation.network import NetworkOptions
 
 __all__ = ["app", "main"]
 
@@ -79,7 +80,11 @@ def build(
     bbox: Bbox = None,
     delimiter: Delimiter = None,
     no_header: NoHeader = False,
-    segmenter: Annotated[str | None, typer.Option(help="density: needs no weights.")] = None,
+    segmenter: Annotated[str | None, typer.Option(help="network, or density, which needs no weights.")] = None,
+    weights: Annotated[
+        Path | None, typer.Option(help="Weights file of the network; the shipped one without it.")
+    ] = None,
+    device: Annotated[str | None, typer.Option(help="Device of the network: cpu or cuda.")] = None,
     resolution: Annotated[float | None, typer.Option(help="Metres per pixel.")] = None,
     work_crs: Annotated[
         str | None, typer.Option(help="Metric CRS to work in; chosen from the data without it.")
@@ -105,6 +110,8 @@ def build(
             raise OutputError(f"folder {path.parent} does not exist", where=path, fix="create it first")
     options = load_options(config, BuildOptions) if config else BuildOptions()
     chosen: dict[str, Any] = {"segmenter": segmenter, "resolution": resolution}
+    if weights or device:
+        chosen |= _network_choice(options.network, segmenter, weights, device)
     if not refine:
         chosen["refine"] = False
     options = replace(options, **{name: value for name, value in chosen.items() if value is not None})
@@ -349,6 +356,17 @@ def _read_fleet(
         delimiter=delimiter,
         header=not no_header,
     )
+
+
+def _network_choice(
+    network: NetworkOptions, segmenter: str | None, weights: Path | None, device: str | None
+) -> dict[str, Any]:
+    """Return the build options that follow from weights or a device on the command line."""
+    if segmenter not in (None, "network"):
+        option = "--weights" if weights else "--device"
+        raise OptionError(f"segmenter {segmenter} runs no network", where=option, fix="use --segmenter network")
+    file = str(weights) if weights else network.weights
+    return {"segmenter": "network", "network": replace(network, weights=file, device=device or network.device)}
 
 
 def _column_map(text: str | None, option: str) -> dict[str, str]:

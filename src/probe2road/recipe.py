@@ -20,7 +20,10 @@ from probe2road.refinement import RefineOptions, refine_graph
 from probe2road.roadgraph import RoadGraph
 from probe2road.segmentation.density import DensityOptions, density_segmenter
 from probe2road.segmentation.mask import threshold_mask
+from probe2road.segmentation.network import NetworkOptions, find_weights, network_segmenter
 from probe2road.segmentation.segmenter import Segmenter
+from probe2road.segmentation.tiling import add_window, predict_window
+from probe2road.segmentation.weights import Weights
 from probe2road.skeleton import skeletonize_windows
 from probe2road.vectorize import VectorizeOptions, vectorize
 from probe2road.workspace import Progress, Workspace, open_workspace
@@ -29,9 +32,7 @@ __all__ = ["SEGMENTERS", "BuildOptions", "Progress", "build", "draw_stages"]
 
 logger = logging.getLogger(__name__)
 
-SEGMENTERS = ("density",)
-
-_WINDOW = 1024  # pixels; side of the windows that are rasterised and segmented one at a time
+SEGMENTERS = ("network", "density")
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class BuildOptions:
     resolution: float = 1.0  # m per pixel
     segmenter: str = "density"  # one of SEGMENTERS
     gaps: TraceGaps = field(default_factory=TraceGaps)  # where traces are broken
+    network: NetworkOptions = field(default_factory=NetworkOptions)  # of the learned segmenter
     density: DensityOptions = field(default_factory=DensityOptions)  # of the density segmenter
     vectorize: VectorizeOptions = field(default_factory=VectorizeOptions)  # how pixels become lines
     clean: CleanOptions = field(default_factory=CleanOptions)  # what counts as a flaw
@@ -88,7 +90,7 @@ def build(
     Raises
     ------
     InputError
-        If the fleet has no fixes.
+        If the fleet has no fixes, or the weights of the network are bad or look at what it does not have.
     OptionError
         If an option makes no sense.
 
@@ -105,11 +107,13 @@ def build(
     """
     options, report = options or BuildOptions(), progress or _silent
     grid = fleet_grid(fleet, resolution=options.resolution)
-    work = open_workspace(workspace, fleet, options)
+    weights = find_weights(fleet, options.network) if options.segmenter == "network" else None
+    work = open_workspace(workspace, fleet, options, weights=weights.digest if weights else None)
     if (graph := work.read_graph("7-roads")) is not None:
         return graph
 
-    probability, segmenter = _segment(fleet, grid, options, work, report)
+    segmenter = _segmenter(fleet, grid, options, weights, work)
+    probability = _segment(fleet, grid, segmenter, options.gaps, work, report)
     mask = threshold_mask(probability, threshold=segmenter.threshold, seed_threshold=segmenter.seed_threshold)
     work.write_raster("2-mask", mask, grid)
     report("skeleton", 0, 1)
@@ -127,30 +131,41 @@ def build(
     return graph
 
 
+def _segmenter(fleet: Fleet, grid: Grid, options: BuildOptions, weights: Weights | None, work: Workspace) -> Segmenter:
+    """Return the segmenter of the options; what the density segmenter estimates is estimated once per run."""
+    if weights is not None:
+        return network_segmenter(weights, grid, options.network)
+    kept = work.read_record("1-density")
+    density = options.density if kept is None else DensityOptions(**kept)
+    segmenter = density_segmenter(fleet, grid, density, gaps=options.gaps)
+    if kept is None:
+        work.write_record("1-density", segmenter.parameters)
+    return segmenter
+
+
 def _segment(
-    fleet: Fleet, grid: Grid, options: BuildOptions, work: Workspace, report: Progress
-) -> tuple[NDArray[np.float32], Segmenter]:
+    fleet: Fleet, grid: Grid, segmenter: Segmenter, gaps: TraceGaps, work: Workspace, report: Progress
+) -> NDArray[np.float32]:
     """Centreline probability of the whole grid ``(rows, cols)``; pages nobody drove on are never touched."""
-    segmenter = density_segmenter(fleet, grid, options.density, gaps=options.gaps)
     if (kept := work.read_raster("1-probability", grid)) is not None:
-        return kept, segmenter
+        return kept
     probability = np.zeros(grid.shape, np.float32)
     driven = 0
-    parts = rasterize_windows(fleet, grid, size=_WINDOW, halo=segmenter.halo, gaps=options.gaps)
-    for window, counts in parts:
+    for window, counts in rasterize_windows(fleet, grid, size=segmenter.window, halo=segmenter.halo, gaps=gaps):
         report("segmentation", window.row, grid.rows)
         name = f"window-{window.row}-{window.col}"
         part = work.read_array(name)
         if part is None:
-            part = segmenter.predict(counts, window.grid(grid))[window.inner]
+            part = predict_window(segmenter, window, counts, grid)
             work.write_array(name, part)
-        probability[window.core] = part
+        add_window(probability, part, window, segmenter)
         driven += 1
     report("segmentation", grid.rows, grid.rows)
-    logger.info("segmented %d windows of %d of %d px (%s)", driven, len(grid.windows(_WINDOW)), _WINDOW, segmenter.name)
+    total = len(grid.windows(segmenter.window))
+    logger.info("segmented %d windows of %d of %d px (%s)", driven, total, segmenter.window, segmenter.name)
     work.write_raster("1-probability", probability, grid)
     work.drop_arrays()
-    return probability, segmenter
+    return probability
 
 
 def draw_stages(folder: str | Path, fleet: Fleet, path: str | Path) -> None:

@@ -1,6 +1,6 @@
 """What the stages of one run leave behind, so that the next run can go on from there.
 
-A workspace is a folder with one file per stage and the fingerprint of the fleet and options that made them.
+A workspace is a folder with one file per stage and the fingerprint of the fleet, options and weights that made them.
 Files are written atomically, so whatever is there is complete. A folder with another fingerprint is emptied
 of its stage files first: stages of two runs never mix.
 """
@@ -37,7 +37,7 @@ Progress = Callable[[str, int, int], None]
 """Called with the stage, how much of it is done, and how much there is."""
 
 _MARK = "run.json"
-_FORMAT = 1  # raised when what a stage writes changes
+_FORMAT = 2  # raised when what a stage writes changes
 
 
 @dataclass(frozen=True)
@@ -76,25 +76,41 @@ class Workspace:
         return read_graph(path)
 
     def write_array(self, name: str, array: NDArray[Any]) -> None:
-        """Keep an array as ``NAME.npy``."""
+        """Keep an array as ``NAME.npz``, compressed: what is kept on the way is many times what is kept at the end."""
         if self.folder is not None:
-            with atomic_path(self.folder / f"{name}.npy") as temporary:
-                np.save(temporary, array)
+            with atomic_path(self.folder / f"{name}.npz") as temporary:
+                np.savez_compressed(temporary, array)
 
     def read_array(self, name: str) -> NDArray[Any] | None:
         """Return an array an earlier run kept, or None."""
-        path = None if self.folder is None else self.folder / f"{name}.npy"
-        return np.load(path) if path is not None and path.exists() else None
+        path = None if self.folder is None else self.folder / f"{name}.npz"
+        if path is None or not path.exists():
+            return None
+        with np.load(path) as arrays:
+            return np.asarray(arrays["arr_0"])
 
     def drop_arrays(self) -> None:
         """Remove the arrays, once a raster holds them all."""
         if self.folder is not None:
-            for path in self.folder.glob("*.npy"):
+            for path in self.folder.glob("*.npz"):
                 path.unlink()
 
+    def write_record(self, name: str, record: dict[str, Any]) -> None:
+        """Keep what a stage was configured with as ``NAME.json``."""
+        if self.folder is not None:
+            with atomic_path(self.folder / f"{name}.json") as temporary:
+                temporary.write_text(json.dumps(record, indent=1))
 
-def open_workspace(folder: str | Path | None, fleet: Fleet, options: DataclassInstance) -> Workspace:
-    """Open the workspace of a run, empty unless it belongs to the same fleet and options.
+    def read_record(self, name: str) -> dict[str, Any] | None:
+        """Return a record an earlier run kept, or None."""
+        path = None if self.folder is None else self.folder / f"{name}.json"
+        return None if path is None or not path.exists() else json.loads(path.read_text())
+
+
+def open_workspace(
+    folder: str | Path | None, fleet: Fleet, options: DataclassInstance, *, weights: str | None = None
+) -> Workspace:
+    """Open the workspace of a run, empty unless it belongs to the same fleet, options and weights.
 
     Parameters
     ----------
@@ -102,6 +118,8 @@ def open_workspace(folder: str | Path | None, fleet: Fleet, options: DataclassIn
         Created where it does not exist; None for a workspace that keeps nothing.
     fleet, options
         What the run works on.
+    weights
+        Digest of the network's weights, if the run uses one.
 
     Raises
     ------
@@ -111,7 +129,7 @@ def open_workspace(folder: str | Path | None, fleet: Fleet, options: DataclassIn
     if folder is None:
         return Workspace(None)
     folder = Path(folder)
-    mark = {"format": _FORMAT, "fleet": fingerprint(fleet), "options": asdict(options)}
+    mark = {"format": _FORMAT, "fleet": fingerprint(fleet), "options": asdict(options), "weights": weights}
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -122,7 +140,7 @@ def open_workspace(folder: str | Path | None, fleet: Fleet, options: DataclassIn
     if path.exists() and json.loads(path.read_text()) != mark:
         logger.info("%s belongs to another run: starting afresh", folder)
         for file in folder.iterdir():
-            if file.suffix in (".tif", ".gpkg", ".npy", ".png"):
+            if file.suffix in (".tif", ".gpkg", ".npz", ".npy", ".json", ".png"):
                 file.unlink()
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(mark, indent=1))

@@ -41,6 +41,7 @@ logger = logging.getLogger(__name__)
 
 _TRUNCATE = 4.5  # kernel half-width, bandwidths; a shorter one ends in a step that curves like a ridge
 _CLOSE_BY = 1 / 3  # bandwidths
+_WINDOW = 1024  # pixels; no influence on the result
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,9 @@ def density_segmenter(
     return Segmenter(
         name="density",
         predict=predict,
+        window=_WINDOW,
         halo=_halo(settled.bandwidth, grid),
+        blend=False,
         threshold=options.threshold,
         seed_threshold=options.seed_threshold,
         parameters=asdict(settled),

@@ -24,9 +24,14 @@ class Segmenter:
         What it is called on the command line and in reports.
     predict
         Maps counts ``(3, rows, cols)`` and their grid to probabilities ``(rows, cols)``, float32 in [0, 1].
-        The probability of a pixel depends on nothing farther away than the halo.
+        Called with a window and its halo.
+    window
+        Side of the windows that it works on, in pixels.
     halo
-        Context that a pixel needs, in pixels.
+        Context on every side of a window, in pixels.
+    blend
+        Whether what it predicts in the halo counts too, so that windows overlap and fade into each other. If
+        not, the probability of a pixel must depend on nothing farther away than the halo.
     threshold
         Probability from which a pixel belongs to a road that is already certain somewhere.
     seed_threshold
@@ -37,7 +42,9 @@ class Segmenter:
 
     name: str
     predict: Callable[[NDArray[np.uint32], Grid], NDArray[np.float32]]
+    window: int
     halo: int
+    blend: bool
     threshold: float
     seed_threshold: float
     parameters: dict[str, Any]

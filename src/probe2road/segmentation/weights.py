@@ -49,20 +49,21 @@ class ModelInfo:
 
     def __post_init__(self) -> None:
         """Refuse what no network can mean."""
+        where = f"model {self.name}"
         if not self.channels or len(set(self.channels)) < len(self.channels):
-            raise OptionError(f"channels are {list(self.channels)}", where="ModelInfo", fix="name each one once")
+            raise OptionError(f"channels are {list(self.channels)}", where=where, fix="name each one once")
         if not self.resolution > 0:
-            raise OptionError(f"resolution is {self.resolution}", where="ModelInfo", fix="use metres per pixel above 0")
+            raise OptionError(f"resolution is {self.resolution}", where=where, fix="use metres per pixel above 0")
         if self.stride < 1 or self.tile < self.stride or self.tile % self.stride:
             raise OptionError(
                 f"a tile of {self.tile} px does not suit a stride of {self.stride} px",
-                where="ModelInfo",
+                where=where,
                 fix="use a multiple of the stride",
             )
         if not 0 < self.threshold <= self.seed_threshold < 1:
             raise OptionError(
                 f"threshold {self.threshold} and seed_threshold {self.seed_threshold} are not in order",
-                where="ModelInfo",
+                where=where,
                 fix="use 0 < threshold <= seed_threshold < 1",
             )
 

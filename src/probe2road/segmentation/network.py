@@ -1,0 +1,164 @@
+"""The learned segmenter: a network from a weights file, tiled over the area."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict, dataclass, replace
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe2road.errors import InputError, OptionError
+from probe2road.fleet import Fleet
+from probe2road.grid import Grid
+from probe2road.raster import CHANNELS
+from probe2road.segmentation.runtime import DEVICES, load_network, run_network
+from probe2road.segmentation.segmenter import Segmenter
+from probe2road.segmentation.weights import ModelInfo, Weights, network_input, read_weights
+
+__all__ = ["NetworkOptions", "find_weights", "network_segmenter", "shipped_weights"]
+
+logger = logging.getLogger(__name__)
+
+_STEPS = np.float32(2**16)  # of the probability between 0 and 1: fewer digits, which compress
+_LARGEST_OVERLAP = 0.9
+_NO_NETWORK = "use --segmenter density"
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """Which network to run, and how."""
+
+    weights: str | None = None  # file; the shipped one that suits the fleet where None
+    device: str = "cpu"  # or "cuda"
+    threads: int | None = None  # at most; all cores where None
+    tile: int | None = None  # px, side of the tiles that the network sees; the model's own where None
+    overlap: float = 0.5  # of neighbouring tiles, as a part of their side
+    threshold: float | None = None  # probability that continues a road; the model's own where None
+    seed_threshold: float | None = None  # probability that starts one; the model's own where None
+
+    def __post_init__(self) -> None:
+        """Refuse values that mean nothing."""
+        where = "NetworkOptions"
+        if self.device not in DEVICES:
+            raise OptionError(f"there is no device {self.device!r}", where=where, fix=f"use {' or '.join(DEVICES)}")
+        if not 0 <= self.overlap <= _LARGEST_OVERLAP:
+            fix = f"use 0 to {_LARGEST_OVERLAP}, 0.5 for half a tile"
+            raise OptionError(f"overlap is {self.overlap}", where=where, fix=fix)
+        for name in ("threads", "tile"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise OptionError(f"{name} is {value}", where=where, fix="use 1 or more")
+
+
+def shipped_weights(*, points: bool) -> Path:
+    """Return the weights file that comes with probe2road, for fleets with semantic points or for traces alone.
+
+    Raises
+    ------
+    InputError
+        If this installation has none.
+    """
+    name = "gnss-vision.onnx" if points else "gnss.onnx"
+    path = Path(str(resources.files("probe2road").joinpath("weights", name)))
+    if not path.is_file():
+        raise InputError("this installation has no weights", where=path, fix=f"name a file, or {_NO_NETWORK}")
+    return path
+
+
+def find_weights(fleet: Fleet, options: NetworkOptions) -> Weights:
+    """Read the weights for a fleet: those of the options, or the shipped ones that look at all the fleet has.
+
+    Raises
+    ------
+    InputError
+        If the file is bad, or its network looks at what the fleet does not have.
+    """
+    points = len(fleet.points) > 0
+    weights = read_weights(options.weights or shipped_weights(points=points))
+    wanted = weights.info.channels
+    unknown = [name for name in wanted if name not in CHANNELS]
+    if unknown:
+        raise InputError(f"no raster has the channels {', '.join(unknown)}", where=weights.path, fix=_NO_NETWORK)
+    if not points and wanted != CHANNELS[:1]:
+        raise InputError(
+            f"the network looks at {', '.join(wanted)}, and the fleet has no semantic points",
+            where=weights.path,
+            fix="give the points, or weights for traces alone",
+        )
+    return weights
+
+
+def network_segmenter(weights: Weights, grid: Grid, options: NetworkOptions | None = None) -> Segmenter:
+    """Return the learned segmenter.
+
+    Parameters
+    ----------
+    weights
+        From `find_weights` or `probe2road.segmentation.weights.read_weights`.
+    grid
+        Grid of the rasters to come.
+    options
+        How to run the network.
+
+    Returns
+    -------
+    Segmenter
+        Named ``network``.
+
+    Raises
+    ------
+    OptionError
+        If the grid has another resolution than the network was trained at, the tile does not suit the network, the
+        thresholds are not in order, or the device is absent.
+    InputError
+        If the network cannot be run.
+
+    Notes
+    -----
+    Paper, section III-B. Tiles overlap as METHOD 0.1 row 13 says; see `probe2road.segmentation.tiling`.
+    """
+    options = options or NetworkOptions()
+    info = _overridden(weights.info, options)
+    if not np.isclose(grid.resolution, info.resolution):
+        raise OptionError(
+            f"the network sees pixels of {info.resolution} m, the raster has {grid.resolution} m",
+            where=weights.path,
+            fix=f"use --resolution {info.resolution} or --segmenter density",
+        )
+    network = load_network(weights, device=options.device, threads=options.threads)
+    channels = [CHANNELS.index(name) for name in info.channels]
+    halo = int(info.tile * options.overlap / 2)
+
+    def predict(counts: NDArray[np.uint32], _grid: Grid) -> NDArray[np.float32]:
+        present, rows, cols = counts.shape
+        if present <= max(channels):
+            what = f"the raster has {present} channels, the network wants {', '.join(info.channels)}"
+            raise InputError(what, where=weights.path, fix=f"give the channels {', '.join(CHANNELS)}")
+        seen = np.zeros((1, len(channels), info.tile, info.tile), np.float32)  # at the far edges too
+        seen[0, :, :rows, :cols] = network_input(counts[channels])
+        probability = run_network(network, seen)[0, :rows, :cols]
+        return np.asarray(np.round(probability * _STEPS) / _STEPS, np.float32)
+
+    return Segmenter(
+        name="network",
+        predict=predict,
+        window=info.tile - 2 * halo,
+        halo=halo,
+        blend=True,
+        threshold=info.threshold,
+        seed_threshold=info.seed_threshold,
+        parameters={"model": info.name, "digest": weights.digest, **asdict(options)},
+    )
+
+
+def _overridden(info: ModelInfo, options: NetworkOptions) -> ModelInfo:
+    """Return what the network promises, with the tile and the thresholds of the options where they have some."""
+    tile = options.tile or info.tile
+    threshold = info.threshold if options.threshold is None else options.threshold
+    seed_threshold = options.seed_threshold
+    if seed_threshold is None:
+        seed_threshold = max(info.seed_threshold, threshold)
+    return replace(info, tile=tile, threshold=threshold, seed_threshold=seed_threshold)
