@@ -32,7 +32,7 @@ with needs_extra("train", feature="training the segmentation network"):
     from torch.nn.parallel import DistributedDataParallel
     from torch.utils.tensorboard import SummaryWriter
 
-__all__ = ["predict_squares", "train", "use_threads"]
+__all__ = ["learning_rate", "predict_squares", "train", "use_threads"]
 
 logger = logging.getLogger(__name__)
 
@@ -99,7 +99,7 @@ def train(
     losses: list[float] = []
     for step, x, y in _batches(config, scenes, state.step, rank):
         for group in state.optimiser.param_groups:
-            group["lr"] = _learning_rate(config, step)
+            group["lr"] = learning_rate(config, step)
         network.train()
         with _mixed(config, where):
             logits = network(x.to(where, memory_format=torch.channels_last))
@@ -149,7 +149,7 @@ def _batches(
             yield step, torch.from_numpy(x), torch.from_numpy(y)
 
 
-def _learning_rate(config: TrainConfig, step: int) -> float:
+def learning_rate(config: TrainConfig, step: int) -> float:
     """Learning rate of a step."""
     rise = min(1.0, (step + 1) / max(config.warm_up, 1))
     fall = 1.0 if config.schedule == "constant" else 0.5 * (1.0 + np.cos(np.pi * step / config.steps))

@@ -19,7 +19,7 @@ from probe2road.labels import draw_lines
 from probe2road.raster import count_pixels
 from probe2road.training.scene import Scene, rows_around
 
-__all__ = ["Sample", "SampleOptions", "draw_sample", "square"]
+__all__ = ["Sample", "SampleOptions", "Vectors", "draw_sample", "sample_vectors", "square", "square_vectors"]
 
 _ROTATIONS = ("none", "right_angles", "any")
 
@@ -66,8 +66,35 @@ class Sample:
 
 
 @dataclass(frozen=True)
+class Vectors:
+    """What is drawn in a sample, in its pixels; places may lie outside.
+
+    Letters: f fixes, p semantic points, v vertices of the edges that are the label.
+    """
+
+    size: int  # pixels
+    row: NDArray[np.int64]  # (f,) of the fixes in driving order
+    col: NDArray[np.int64]  # (f,)
+    z: NDArray[np.float32]  # (f,) m
+    breaks: NDArray[np.bool_]  # (f,) where no segment leads from the fix before
+    point_row: NDArray[np.int64]  # (p,)
+    point_col: NDArray[np.int64]  # (p,)
+    point_kind: NDArray[np.int64]  # (p,) position in POINT_KINDS
+    label_row: NDArray[np.int64]  # (v,)
+    label_col: NDArray[np.int64]  # (v,)
+    label_edge: NDArray[np.int64]  # (v,) edge of each vertex
+
+    def drawn(self, label_width: int) -> Sample:
+        """Draw the rasters."""
+        shape = self.size, self.size
+        points = self.point_row, self.point_col, self.point_kind
+        counts = count_pixels(self.row, self.col, self.breaks, *points, shape)
+        return Sample(counts, draw_lines(self.label_row, self.label_col, self.label_edge, shape, width=label_width))
+
+
+@dataclass(frozen=True)
 class _Frame:
-    """Where a sample lies: pixel = offset + turn @ (place - centre)."""
+    """Where a sample lies: pixel = turn @ (place - centre) + size / 2."""
 
     centre: tuple[float, float]  # m from the scene's origin
     turn: NDArray[np.float64]  # (2, 2): place to (column, row)
@@ -81,7 +108,17 @@ class _Frame:
 
 
 def draw_sample(scene: Scene, rng: np.random.Generator, options: SampleOptions) -> Sample:
-    """Draw a sample at random.
+    """Draw a sample at random; the rasters of `sample_vectors`."""
+    return sample_vectors(scene, rng, options).drawn(options.label_width)
+
+
+def square(scene: Scene, centre: tuple[float, float], options: SampleOptions) -> Sample:
+    """Draw the square around a place as it is; the rasters of `square_vectors`."""
+    return square_vectors(scene, centre, options).drawn(options.label_width)
+
+
+def sample_vectors(scene: Scene, rng: np.random.Generator, options: SampleOptions) -> Vectors:
+    """Choose a place, a turn and drives at random, and fetch what these drives recorded there.
 
     Parameters
     ----------
@@ -94,18 +131,22 @@ def draw_sample(scene: Scene, rng: np.random.Generator, options: SampleOptions) 
 
     Returns
     -------
-    Sample
+    Vectors
     """
     frame = _Frame(_centre(scene, rng, options), _turn(rng, options), options.size)
     kept = _kept_drives(scene, rng, options)
     offset = rng.normal(0.0, rng.choice(options.offsets), (scene.n_drives, 2)).astype(np.float32)
-    interval = float(rng.choice(options.intervals))
-    points = rng.uniform(options.least_points, 1.0)
-    return _drawn(scene, frame, kept, options, offset=offset, interval=interval, points=points, rng=rng)
+    reach = options.size * 0.75 + 4 * float(np.abs(offset).max(initial=0.0)) + _SEGMENT
+    interval, phase = float(rng.choice(options.intervals)), rng.random(scene.n_drives).astype(np.float32)
+    fixes, late = _fixes(scene, frame, kept, reach), max(_LATE, 3 * interval)
+    fixes = fixes[_sampled(scene.fix_drive[fixes], scene.fix_time[fixes], interval, phase)]
+    points = _points(scene, frame, kept, reach)
+    points = points[rng.random(len(points)) < rng.uniform(options.least_points, 1.0)]
+    return _vectors(scene, frame, fixes, points, offset, late, _labelled(scene, kept, options))
 
 
-def square(scene: Scene, centre: tuple[float, float], options: SampleOptions) -> Sample:
-    """Draw the square around a place as it is: north up, all drives, nothing disturbed.
+def square_vectors(scene: Scene, centre: tuple[float, float], options: SampleOptions) -> Vectors:
+    """Fetch the square around a place as it is: north up, all drives, nothing disturbed.
 
     Parameters
     ----------
@@ -114,12 +155,14 @@ def square(scene: Scene, centre: tuple[float, float], options: SampleOptions) ->
     centre
         ``(x, y)`` in metres from the scene's origin.
     options
-        Of which only ``size``, ``min_drives`` and ``label_width`` are used.
+        Of which only ``size`` and ``min_drives`` are used.
     """
     frame = _Frame(centre, _TURNS[0], options.size)
     kept = np.ones(scene.n_drives, bool)
+    reach = options.size / 2 + _SEGMENT
+    fixes, points = _fixes(scene, frame, kept, reach), _points(scene, frame, kept, reach)
     offset = np.zeros((scene.n_drives, 2), np.float32)
-    return _drawn(scene, frame, kept, options, offset=offset, interval=0.0, points=1.0, rng=np.random.default_rng(0))
+    return _vectors(scene, frame, fixes, points, offset, _LATE, _labelled(scene, kept, options))
 
 
 _TURNS = np.array(
@@ -159,44 +202,46 @@ def _kept_drives(scene: Scene, rng: np.random.Generator, options: SampleOptions)
     return rng.random(scene.n_drives) < share
 
 
-def _drawn(
-    scene: Scene,
-    frame: _Frame,
-    kept: NDArray[np.bool_],
-    options: SampleOptions,
-    *,
-    offset: NDArray[np.float32],
-    interval: float,
-    points: float,
-    rng: np.random.Generator,
-) -> Sample:
-    """Draw what the kept drives recorded, each moved by its offset, and the edges that enough of them passed."""
-    reach = options.size * 0.75 + 4 * float(np.abs(offset).max(initial=0.0)) + _SEGMENT
+def _fixes(scene: Scene, frame: _Frame, kept: NDArray[np.bool_], reach: float) -> NDArray[np.int32]:
+    """List the fixes of kept drives around a frame, in driving order."""
     fixes = np.sort(scene.fix_rows[rows_around(scene.fix_cells, scene.table, frame.centre, reach)])
-    fixes = fixes[kept[scene.fix_drive[fixes]]]
-    drive, time = scene.fix_drive[fixes], scene.fix_time[fixes]
-    phase = rng.random(len(kept)).astype(np.float32)
-    chosen = _sampled(drive, time, interval, phase)
-    fixes, drive, time = fixes[chosen], drive[chosen], time[chosen]
-    xy = scene.fix_xyz[fixes, :2] + offset[drive]
-    breaks = _breaks(drive, time, xy, max(_LATE, 3 * interval))
-    row, col = frame.pixels(xy)
-    seen = rows_around(scene.point_cells, scene.table, frame.centre, reach)
-    seen = seen[kept[scene.point_drive[seen]] & (rng.random(len(seen)) < points)]
-    point_row, point_col = frame.pixels(scene.point_xy[seen] + offset[scene.point_drive[seen]])
-    kind = scene.point_kind[seen].astype(np.int64)
-    counts = count_pixels(row, col, breaks, point_row, point_col, kind, (options.size, options.size))
-    return Sample(counts, _label(scene, frame, kept, options))
+    return fixes[kept[scene.fix_drive[fixes]]]
 
 
-def _label(scene: Scene, frame: _Frame, kept: NDArray[np.bool_], options: SampleOptions) -> NDArray[np.uint8]:
-    """Draw the edges that at least ``min_drives`` of the kept drives passed."""
+def _points(scene: Scene, frame: _Frame, kept: NDArray[np.bool_], reach: float) -> NDArray[np.int64]:
+    """List the semantic points of kept drives around a frame."""
+    points = rows_around(scene.point_cells, scene.table, frame.centre, reach)
+    return points[kept[scene.point_drive[points]]]
+
+
+def _labelled(scene: Scene, kept: NDArray[np.bool_], options: SampleOptions) -> NDArray[np.int64]:
+    """List the vertices of the edges that at least ``min_drives`` of the kept drives passed."""
     total = np.concatenate([[0], np.cumsum(kept[scene.edge_drives])])
     support = total[scene.edge_starts[1:]] - total[scene.edge_starts[:-1]]
-    vertices = np.flatnonzero((support >= options.min_drives)[scene.vertex_edge])
-    row, col = frame.pixels(scene.vertex_xy[vertices])
-    owner = scene.vertex_edge[vertices].astype(np.int64)
-    return draw_lines(row, col, owner, (options.size, options.size), width=options.label_width)
+    return np.flatnonzero((support >= options.min_drives)[scene.vertex_edge])
+
+
+def _vectors(
+    scene: Scene,
+    frame: _Frame,
+    fixes: NDArray[np.int32],
+    points: NDArray[np.int64],
+    offset: NDArray[np.float32],
+    late: float,
+    vertices: NDArray[np.int64],
+) -> Vectors:
+    """Bring fixes, points and vertices into the pixels of a frame, those of each drive moved by its offset."""
+    drive, xyz = scene.fix_drive[fixes], scene.fix_xyz[fixes]
+    xy = xyz[:, :2] + offset[drive]
+    row, col = frame.pixels(xy)
+    point_row, point_col = frame.pixels(scene.point_xy[points] + offset[scene.point_drive[points]])
+    label_row, label_col = frame.pixels(scene.vertex_xy[vertices])
+    return Vectors(
+        size=frame.size,
+        row=row, col=col, z=xyz[:, 2], breaks=_breaks(drive, scene.fix_time[fixes], xy, late),
+        point_row=point_row, point_col=point_col, point_kind=scene.point_kind[points].astype(np.int64),
+        label_row=label_row, label_col=label_col, label_edge=scene.vertex_edge[vertices].astype(np.int64),
+    )  # fmt: skip
 
 
 _SEGMENT = 150.0  # m; a longer step is no segment (`probe2road.fleet.TraceGaps.max_step`)
