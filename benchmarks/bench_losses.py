@@ -69,7 +69,7 @@ def losses(size: int, images: int, device: str) -> Iterator[tuple[str, float]]:
     target = torch.from_numpy(reference).float().to(device)
     logits = torch.from_numpy(prediction).float().to(device).mul(6).sub(3).requires_grad_()
     for kind in ("bce_dice", "cp"):
-        loss = loss_function(LossOptions(kind=kind))
+        loss = loss_function(LossOptions(kind=kind, warm_up=0))
         yield f"{kind} with gradient", best_of(REPEATS, lambda loss=loss: finish(loss(logits, target, 0)))  # type: ignore[misc]
 
 

@@ -151,7 +151,7 @@ def test_extreme_logits_give_finite_losses_and_gradients(kind, road, dtype, smoo
 @pytest.mark.parametrize("kind", ["bce_dice", "cp"])
 def test_empty_tiles_are_safe(kind, level, smooth):
     logits = torch.full((2, 1, 16, 16), level, requires_grad=True)
-    loss = loss_function(LossOptions(kind=kind, smooth=smooth))(logits, torch.zeros(2, 1, 16, 16), 0)
+    loss = loss_function(LossOptions(warm_up=0, kind=kind, smooth=smooth))(logits, torch.zeros(2, 1, 16, 16), 0)
     loss.backward()
     assert bool(torch.isfinite(loss))
     assert bool(torch.isfinite(logits.grad).all())
@@ -177,14 +177,14 @@ def test_the_loss_is_that_of_the_weights_of_its_own_prediction():
     prediction, reference = (logits[0] > 0).numpy(), (target[0] > 0).numpy()
     weights = connectivity_weights(prediction, reference, sigma=20, buffer="3x3")
     expected = cp_loss(logits[0], target[0], *map(torch.from_numpy, weights), ce_weight=7, smooth=2)
-    loss = loss_function(LossOptions(sigma=20, buffer="3x3", ce_weight=7, smooth=2))
+    loss = loss_function(LossOptions(warm_up=0, sigma=20, buffer="3x3", ce_weight=7, smooth=2))
     assert float(loss(logits, target, 0)) == float(expected)
 
 
 def test_images_have_weights_of_their_own():
     logits, target = crossing()
     both = torch.cat([logits, 6 * target - 3]), torch.cat([target, target])
-    loss = loss_function(LossOptions(ce_weight=1e6, buffer="3x3"))
+    loss = loss_function(LossOptions(warm_up=0, ce_weight=1e6, buffer="3x3"))
     alone = [float(loss(part, target, 0)) for part in (logits, 6 * target - 3)]
     assert float(loss(*both, 0)) == pytest.approx(np.mean(alone), rel=1e-5)
 
@@ -193,7 +193,7 @@ def test_the_threshold_decides_what_is_wrong():
     logits, target = crossing()
     hidden = logits.clone()
     hidden[..., 5, 25:45] = -1  # probability 0.27: a ghost for a threshold of 0.2 only
-    values = [float(loss_function(LossOptions(threshold=t))(hidden, target, 0)) for t in (0.2, 0.5)]
+    values = [float(loss_function(LossOptions(warm_up=0, threshold=t))(hidden, target, 0)) for t in (0.2, 0.5)]
     assert values[0] > values[1]
 
 
@@ -202,7 +202,7 @@ def test_warm_up_is_bce_and_dice():
     loss = loss_function(LossOptions(warm_up=3, ce_weight=2))
     values = [float(loss(logits, target, step)) for step in range(5)]
     assert values[:3] == [float(bce_dice(logits, target, ce_weight=2))] * 3
-    assert values[3:] == [float(loss_function(LossOptions(ce_weight=2))(logits, target, 0))] * 2
+    assert values[3:] == [float(loss_function(LossOptions(warm_up=0, ce_weight=2))(logits, target, 0))] * 2
     assert values[3] != values[2]
 
 
@@ -210,7 +210,7 @@ def test_training_reconnects_what_the_prediction_cut():
     """Gradient descent on the logits themselves: the gap must close and the ghost must go."""
     logits, target = crossing()
     logits = logits.requires_grad_()
-    loss = loss_function(LossOptions(ce_weight=100))
+    loss = loss_function(LossOptions(warm_up=0, ce_weight=100))
     optimiser = torch.optim.Adam([logits], lr=0.3)
     for step in range(40):
         optimiser.zero_grad()
@@ -222,7 +222,7 @@ def test_training_reconnects_what_the_prediction_cut():
 def test_missed_road_weighs_more_than_with_plain_entropy():
     logits, target = crossing()
     pulls = []
-    for loss in (loss_function(LossOptions(buffer="3x3")), loss_function(LossOptions(kind="bce_dice"))):
+    for loss in (loss_function(LossOptions(warm_up=0, buffer="3x3")), loss_function(LossOptions(kind="bce_dice"))):
         x = logits.clone().requires_grad_()
         loss(x, target, 0).backward()
         missed, certain = x.grad[0, 0, 24, 25], x.grad[0, 0, 24, 45]

@@ -47,7 +47,7 @@ class LossOptions:
     """What training minimises."""
 
     kind: str = "cp"  # bce_dice, or cp: the connectivity-preserving loss
-    warm_up: int = 0  # steps of BCE + Dice before CP-loss begins
+    warm_up: int = 2000  # steps of BCE + Dice before CP-loss; some 30 epochs of the paper's tiles (METHOD 0.1 row 9)
     sigma: float = 100.0  # px, reach of a wrong skeleton (METHOD 0.1 row 11)
     buffer: str = "2x2"  # what a skeleton may deviate: 2x2 (the paper's, one-sided) or 3x3
     thinning: str = "zhang_suen"  # how skeletons are made for CP-loss: zhang_suen (the source's) or guo_hall
@@ -172,7 +172,7 @@ def loss_function(options: LossOptions | None = None) -> Loss:
     Parameters
     ----------
     options
-        CP-loss from the first step on where None.
+        CP-loss after the default warm-up where None.
 
     Returns
     -------
