@@ -119,6 +119,14 @@ def test_options_come_from_toml(folder, call):
         (["build", "drives.csv", *COLUMNS, "--bbox", "1,2,3", "-o", "x.gpkg"], "left,bottom,right,top"),
         (["build", "drives.csv", "--columns", "trip", "-o", "x.gpkg"], "ours=theirs"),
         (["build", "drives.csv", *COLUMNS, "--segmenter", "magic", "-o", "x.gpkg"], "use network or density"),
+        (
+            ["build", "drives.csv", *COLUMNS, "--weights", "absent.onnx", "-o", "x.gpkg"],
+            "absent.onnx: weights cannot be",
+        ),
+        (
+            ["build", "drives.csv", *COLUMNS, "--weights", "x.onnx", "--segmenter", "density", "-o", "x.gpkg"],
+            "--weights: segmenter density runs no network; use --segmenter network",
+        ),
         (["build", "drives.csv", *COLUMNS, "--config", "wrong.toml", "-o", "x.gpkg"], "there is no option 'bandwith'"),
         (["build", "drives.csv", *COLUMNS, "--config", "type.toml", "-o", "x.gpkg"], "is not of type float"),
         (["evaluate", "absent.gpkg", "absent.gpkg"], "absent.gpkg: no such file"),

@@ -100,6 +100,30 @@ def test_an_interrupted_run_goes_on_where_it_stopped(crossing, tmp_path, monkeyp
     assert graph.edges.geometry.geom_equals_exact(whole.edges.geometry, 1e-6).all()
 
 
+def test_the_bandwidth_is_estimated_once_for_all_parts_of_a_run(crossing, tmp_path, monkeypatch):
+    estimates, predictions = [], []
+
+    def estimating(fleet, grid, *, gaps):
+        estimates.append(5.0)
+        return 5.0
+
+    def failing_at_first(counts, grid, options):
+        predictions.append(options.bandwidth)
+        if len(predictions) == 1:
+            raise KeyboardInterrupt
+        return density_probability(counts, grid, options)
+
+    monkeypatch.setattr("probe2road.segmentation.density.estimate_bandwidth", estimating)
+    monkeypatch.setattr("probe2road.segmentation.density.density_probability", failing_at_first)
+    with pytest.raises(KeyboardInterrupt):
+        build(crossing, BuildOptions(refine=False), workspace=tmp_path / "work")
+    build(crossing, BuildOptions(refine=False), workspace=tmp_path / "work")
+    (tmp_path / "work" / "7-roads.gpkg").unlink()
+    build(crossing, BuildOptions(refine=False), workspace=tmp_path / "work")
+    assert estimates == [5.0]
+    assert set(predictions) == {5.0}
+
+
 def test_a_workspace_of_another_run_is_not_mixed_in(crossing, tmp_path, caplog):
     build(crossing, workspace=tmp_path / "work")
     with caplog.at_level(logging.INFO):

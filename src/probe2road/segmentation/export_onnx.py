@@ -20,17 +20,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from probe2road.errors import InputError, MissingExtraError, OutputError
+from probe2road.errors import InputError, OutputError, needs_extra
 from probe2road.io.atomic import atomic_path
 from probe2road.segmentation.runtime import load_network, run_network
-from probe2road.segmentation.weights import METADATA_KEY, ModelInfo, metadata_text, network_input, read_weights
+from probe2road.segmentation.weights import ModelInfo, network_input, pack_weights, read_weights
 
-try:
+with needs_extra("train", feature="exporting and loading networks"):
     import onnx
     import torch
     from torch import nn
-except ImportError as error:
-    raise MissingExtraError.for_extra("train", feature="exporting and loading networks") from error
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -88,11 +86,9 @@ def export(network: nn.Module, info: ModelInfo, path: str | Path, *, half: bool 
     onnx_model = _graph(model, info)
     if half:
         _halve(onnx_model)
-    body = onnx_model.SerializeToString(deterministic=True)
-    tail = onnx.ModelProto()
-    tail.metadata_props.add(key=METADATA_KEY, value=metadata_text(info, body))
+    data = pack_weights(onnx_model.SerializeToString(deterministic=True), info)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(body + tail.SerializeToString(deterministic=True))
+        temporary.write_bytes(data)
         stored = run_network(load_network(read_weights(temporary)), tiles)
         difference = float(np.abs(stored - _run_torch(model, tiles)).max())
         if not difference <= _TOLERANCE:
@@ -100,7 +96,7 @@ def export(network: nn.Module, info: ModelInfo, path: str | Path, *, half: bool 
     rounding = np.abs(stored - exact)
     logger.info(
         "wrote %s: %.1f MB; on noise %.1g from torch at most; rounding moves it by %.1g on average and %.1g at most",
-        *(path, len(body) / 1e6, difference, rounding.mean(), rounding.max()),
+        *(path, len(data) / 1e6, difference, rounding.mean(), rounding.max()),
     )
 
 

@@ -1,11 +1,11 @@
-"""What a weights file is: one ONNX file that holds a network, and beside it what the network expects and promises.
+"""What a weights file is: one ONNX file that holds a network, what it expects and promises, and a checksum.
 
 Strategy
 --------
-A file is the serialised ONNX model, followed by its metadata as one more field of the same message. Protocol buffer
-messages may be concatenated, so that any program for ONNX opens the file. It lets us read the metadata without a
-runtime, see at once that a file is cut off, and check a digest of everything before the metadata: a flipped bit in the
-weights would otherwise pass as slightly worse roads.
+A file is the serialised ONNX model, followed by two more fields of the same protocol buffer message: our metadata,
+and a digest of all before it. Such messages may be concatenated, so any program for ONNX opens the file. For us it
+means that metadata can be read without a runtime, that a file which is cut off is told from one that is foreign, and
+that a flipped bit does not pass as slightly worse roads.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from probe2road.errors import InputError, OptionError
 
-__all__ = ["FORMAT", "METADATA_KEY", "ModelInfo", "Weights", "metadata_text", "network_input", "read_weights"]
+__all__ = ["FORMAT", "ModelInfo", "Weights", "network_input", "pack_weights", "read_weights"]
 
 FORMAT = 1  # raised when older versions of probe2road could not use a new file
-METADATA_KEY = "probe2road"
 
-_METADATA_FIELD = 14  # metadata_props in ONNX's ModelProto
-_TEXT = 2  # wire type of length-delimited fields, the only one that metadata has
+_INFO, _DIGEST = b"probe2road", b"probe2road.digest"  # keys of our metadata
+_METADATA_FIELD = 14  # metadata_props in ONNX's ModelProto: messages of a key (1) and a value (2)
+_TEXT = 2  # wire type of length-delimited fields, the only one in metadata
 _FIXED_BYTES = {1: 8, 5: 4}  # of the wire types of fixed length
 _NOT_OURS = "use a file that probe2road train has exported, or --segmenter density"
+_COPY = "copy the file again"
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class Weights:
 
     info: ModelInfo
     model: bytes  # the whole file, an ONNX model
-    digest: str  # of everything but the metadata; equal for equal networks
+    digest: str  # equal for equal networks with equal metadata
     path: Path
 
 
@@ -87,15 +88,17 @@ def network_input(counts: ArrayLike) -> NDArray[np.float32]:
 
     Examples
     --------
-    >>> network_input([0, 9, 99])
+    >>> network_input([0, 9, 99]).round(3)
     array([0., 1., 2.], dtype=float32)
     """
     return np.log10(1.0 + np.asarray(counts, np.float32), dtype=np.float32)
 
 
-def metadata_text(info: ModelInfo, model: bytes) -> str:
-    """Return the metadata to store with a serialised ONNX model that has none yet."""
-    return json.dumps({"format": FORMAT, "digest": _digest(model), **asdict(info)}, sort_keys=True)
+def pack_weights(model: bytes, info: ModelInfo) -> bytes:
+    """Return the content of a weights file: a serialised ONNX model and its metadata."""
+    text = json.dumps({"format": FORMAT, **asdict(info)}, sort_keys=True)
+    data = model + _entry(_INFO, text.encode())
+    return data + _entry(_DIGEST, _digest(data).encode())
 
 
 def read_weights(path: str | Path) -> Weights:
@@ -117,18 +120,16 @@ def read_weights(path: str | Path) -> Weights:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"weights cannot be read ({error.strerror})", where=path) from error
-    text, body = _metadata(data, path)
+    text, digest = _metadata(data, path)
     try:
         table = json.loads(text)
-        version, digest = table.pop("format"), table.pop("digest")
+        version = int(table.pop("format"))
     except (ValueError, KeyError, AttributeError, TypeError) as error:
-        raise InputError("the metadata of the weights are damaged", where=path, fix=_NOT_OURS) from error
+        raise InputError("the metadata of the weights are damaged", where=path, fix=_COPY) from error
     if version > FORMAT:
         raise InputError(
             f"weights of format {version}; this version reads up to {FORMAT}", where=path, fix="update probe2road"
         )
-    if digest != _digest(data[:body]):
-        raise InputError("the weights are damaged: their checksum differs", where=path, fix="copy the file again")
     return Weights(_info(table, path), data, digest, path)
 
 
@@ -143,20 +144,39 @@ def _info(table: dict[str, Any], path: Path) -> ModelInfo:
         raise InputError(f"the metadata of the weights make no sense ({error})", where=path, fix=_NOT_OURS) from error
 
 
-def _metadata(data: bytes, path: Path) -> tuple[str, int]:
-    """Return our metadata in a serialised ONNX model, and how many bytes stand before it."""
-    foreign = InputError("not a weights file of probe2road", where=path, fix=_NOT_OURS)
+def _metadata(data: bytes, path: Path) -> tuple[bytes, str]:
+    """Return our metadata and the digest in a file's content, found to be complete."""
+    entries, place = {}, 0
     try:
         for number, start, content in _fields(data):
             if number == _METADATA_FIELD:
-                entry = {key: text for key, _, text in _fields(content)}
-                if entry.get(1) == METADATA_KEY.encode():
-                    return entry[2].decode(), start
+                entry = {key: value for key, _, value in _fields(content)}
+                entries[entry.get(1)] = entry.get(2, b"")
+            place = start
     except EOFError as error:
-        raise InputError("the weights are cut off, or no ONNX file", where=path, fix="copy the file again") from error
-    except (ValueError, KeyError) as error:
-        raise foreign from error
-    raise foreign
+        raise InputError("the weights are cut off, or no ONNX file", where=path, fix=_COPY) from error
+    except ValueError as error:
+        raise InputError("not a weights file", where=path, fix=_NOT_OURS) from error
+    if _INFO not in entries:
+        raise InputError("not a weights file of probe2road", where=path, fix=_NOT_OURS)
+    digest = _digest(data[:place])  # the digest is the last field, and of all before it
+    if entries.get(_DIGEST) != digest.encode():
+        raise InputError("the weights are damaged: their checksum differs", where=path, fix=_COPY)
+    return entries[_INFO], digest
+
+
+def _entry(key: bytes, value: bytes) -> bytes:
+    """Return one metadata field of an ONNX model."""
+    return _field(_METADATA_FIELD, _field(1, key) + _field(2, value))
+
+
+def _field(number: int, content: bytes) -> bytes:
+    """Return one length-delimited field of a protocol buffer message."""
+    length, digits = len(content), bytearray([number << 3 | _TEXT])
+    while length > 127:
+        digits.append(length & 127 | 128)
+        length >>= 7
+    return bytes(digits) + bytes([length]) + content
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, int, bytes]]:

@@ -1,0 +1,175 @@
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe2road.errors import InputError, OptionError
+from probe2road.fleet import fleet_from_tables
+from probe2road.grid import Grid
+from probe2road.raster import fleet_grid, rasterize
+from probe2road.recipe import BuildOptions, build
+from probe2road.segmentation.network import NetworkOptions, find_weights, network_segmenter, shipped_weights
+from probe2road.segmentation.tiling import segment_raster
+from probe2road.segmentation.weights import read_weights
+
+CRS = "EPSG:32616"
+GNSS = ("traces",)
+
+
+def crossing(*, points=False, n=8):
+    """A fleet on two streets of 800 m that cross, eight drives each, a fix every 15 m."""
+    rng = np.random.default_rng(0)
+    at = np.arange(0.0, 800.0, 15.0)
+    drives = []
+    for number in range(2 * n):
+        along, across = at, np.full(len(at), 400.0 + rng.normal(0, 1.0))
+        x, y = (along, across) if number % 2 else (across, along)
+        drives.append(pd.DataFrame({"trace_id": number, "t": np.arange(len(at)), "x": 446000 + x, "y": 4636000 + y}))
+    table = pd.concat(drives)
+    seen = table[["trace_id", "t", "x", "y"]].assign(z=0.0, kind="lane_marking") if points else None
+    return fleet_from_tables(table, seen, crs=CRS, target_crs=CRS)
+
+
+@pytest.fixture(scope="module")
+def fleet():
+    return crossing()
+
+
+def options(path, **changes):
+    return BuildOptions(
+        segmenter="network", network=NetworkOptions(weights=str(path), threads=1, **changes), refine=False
+    )
+
+
+def test_a_crossing_comes_out(fleet, write_weights):
+    graph = build(fleet, options(write_weights(GNSS)))
+    assert sorted(graph.degrees()) == [1, 1, 1, 1, 4]
+    assert graph.length == pytest.approx(4 * 400, abs=40)
+
+
+def test_tiles_agree_with_the_whole(fleet, write_weights):
+    grid, weights = fleet_grid(fleet), read_weights(write_weights())
+    counts = rasterize(fleet, grid)
+    tiled, whole = (
+        segment_raster(network_segmenter(weights, grid, NetworkOptions(threads=1, **cut)), counts, grid)
+        for cut in ({"tile": 128, "overlap": 0.5}, {"tile": 1024, "overlap": 0.0})
+    )
+    assert whole.max() > 0.9
+    # This network looks 2 pixels far, so what it sees differs only where tiles begin and end.
+    rows, cols = ((np.arange(length) - 32) % 64 for length in grid.shape)
+    inside = np.logical_and.outer((rows >= 2) & (rows < 62), (cols >= 2) & (cols < 62))
+    # Far from all traces it says 0.002, where tiles that are never looked at say 0.
+    np.testing.assert_allclose(*(np.maximum(array[inside], 0.01) for array in (tiled, whole)), atol=1e-5)
+
+
+def test_a_run_goes_on_where_it_stopped(fleet, write_weights, tmp_path, monkeypatch):
+    chosen = options(write_weights(GNSS))
+    whole = build(fleet, chosen)
+    from probe2road import recipe
+
+    calls, predict = [], recipe.predict_window
+
+    def counting(segmenter, window, counts, grid):
+        calls.append(window)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        return predict(segmenter, window, counts, grid)
+
+    monkeypatch.setattr("probe2road.recipe.predict_window", counting)
+    with pytest.raises(KeyboardInterrupt):
+        build(fleet, chosen, workspace=tmp_path / "work")
+    assert len(list((tmp_path / "work").glob("window-*.npz"))) == 4
+    graph = build(fleet, chosen, workspace=tmp_path / "work")
+    assert calls[4] == calls[5]
+    assert len(calls) - 1 == len(set(calls)) > 8
+    assert graph.edges.geometry.geom_equals_exact(whole.edges.geometry, 0.0).all()
+    assert not list((tmp_path / "work").glob("*.npz"))
+
+
+def test_other_weights_in_the_same_file_start_a_run_afresh(fleet, write_weights, tmp_path, caplog):
+    chosen = options(write_weights(GNSS))
+    build(fleet, chosen, workspace=tmp_path / "work")
+    write_weights(GNSS, threshold=0.4)
+    with caplog.at_level(logging.INFO):
+        build(fleet, chosen, workspace=tmp_path / "work")
+    assert "starting afresh" in caplog.text
+
+
+@pytest.mark.parametrize(("points", "name"), [(True, "gnss-vision.onnx"), (False, "gnss.onnx")])
+def test_the_shipped_weights_suit_the_fleet(points, name, write_weights, monkeypatch, tmp_path):
+    (tmp_path / "weights").mkdir()
+    for channels, file in ((GNSS, "gnss.onnx"), (("traces", "lane_markings", "road_boundaries"), "gnss-vision.onnx")):
+        write_weights(channels, file=f"weights/{file}")
+    monkeypatch.setattr("importlib.resources.files", lambda package: tmp_path)
+    weights = find_weights(crossing(points=points, n=1), NetworkOptions())
+    assert weights.path.name == name
+
+
+def test_an_installation_without_weights_says_so(monkeypatch, tmp_path):
+    monkeypatch.setattr("importlib.resources.files", lambda package: tmp_path)
+    with pytest.raises(InputError, match=r"gnss\.onnx: this installation has no weights; .*--segmenter density"):
+        shipped_weights(points=False)
+
+
+def test_weights_that_look_at_points_need_points(fleet, write_weights):
+    with pytest.raises(InputError, match="looks at traces, lane_markings, road_boundaries, and the fleet has no sem"):
+        build(fleet, options(write_weights()))
+
+
+def test_weights_for_traces_serve_fleets_with_points(write_weights):
+    assert (
+        find_weights(crossing(points=True, n=1), NetworkOptions(weights=str(write_weights(GNSS)))).info.channels == GNSS
+    )
+
+
+def test_weights_that_look_at_an_unknown_channel_are_refused(fleet, write_weights):
+    with pytest.raises(InputError, match=r"weights\.onnx: no raster has the channels heading; use --segmenter density"):
+        build(fleet, options(write_weights(("traces", "heading"))))
+
+
+def test_a_raster_with_too_few_channels_is_refused(fleet, write_weights):
+    grid = fleet_grid(fleet)
+    segmenter = network_segmenter(read_weights(write_weights()), grid, NetworkOptions(threads=1))
+    with pytest.raises(InputError, match="the raster has 1 channels, the network wants traces, lane_markings, road"):
+        segment_raster(segmenter, rasterize(fleet, grid)[:1], grid)
+
+
+def test_another_resolution_is_refused(fleet, write_weights):
+    with pytest.raises(OptionError, match=r"pixels of 1\.0 m, the raster has 0\.5 m; use --resolution 1\.0"):
+        build(fleet, replace(options(write_weights(GNSS)), resolution=0.5))
+
+
+def test_an_all_zero_raster_has_no_roads(fleet, write_weights):
+    grid = fleet_grid(fleet)
+    segmenter = network_segmenter(read_weights(write_weights()), grid, NetworkOptions(threads=1))
+    assert not segment_raster(segmenter, np.zeros((3, *grid.shape), np.uint32), grid).any()
+
+
+def test_options_take_precedence_over_the_model(write_weights):
+    grid = Grid(446000.0, 4636000.0, 1.0, 64, 64, crossing(n=1).crs)
+    weights = read_weights(write_weights(threshold=0.4, seed_threshold=0.6))
+    own = network_segmenter(weights, grid)
+    assert (own.threshold, own.seed_threshold, own.window, own.halo, own.blend) == (0.4, 0.6, 128, 64, True)
+    assert own.parameters["model"] == "blur"
+    other = network_segmenter(weights, grid, NetworkOptions(threshold=0.7, tile=512, overlap=0.25))
+    assert (other.threshold, other.seed_threshold, other.window, other.halo) == (0.7, 0.7, 384, 64)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"device": "tpu"}, "there is no device 'tpu'; use cpu or cuda"),
+        ({"overlap": 1.0}, "overlap is 1.0"),
+        ({"overlap": -0.5}, "overlap is -0.5"),
+        ({"threads": 0}, "threads is 0"),
+        ({"tile": 0}, "tile is 0"),
+        ({"tile": 1000}, "model blur: a tile of 1000 px does not suit a stride of 32 px"),
+        ({"threshold": 1.5}, "model blur: threshold 1.5"),
+        ({"threshold": 0.6, "seed_threshold": 0.5}, "model blur: threshold 0.6 and seed_threshold 0.5"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(changes, message, fleet, write_weights):
+    with pytest.raises(OptionError, match=message):
+        network_segmenter(read_weights(write_weights()), fleet_grid(fleet), NetworkOptions(**changes))
