@@ -30,6 +30,7 @@ __all__ = [
     "clean_graph",
     "collapse_short_edges",
     "drop_dead_ends",
+    "drop_edges",
     "drop_small_components",
     "merge_degree_two_nodes",
 ]
@@ -99,6 +100,35 @@ def clean_graph(graph: RoadGraph, options: CleanOptions | None = None) -> RoadGr
     return graph
 
 
+def drop_edges(graph: RoadGraph, dropped: NDArray[np.bool_], *, why: str) -> RoadGraph:
+    """Drop edges, the nodes that lose their last edge, and the turns on them; the graph itself where none is.
+
+    Parameters
+    ----------
+    graph
+        Any road graph.
+    dropped
+        Which, in the order of the edges.
+    why
+        For the log: "removed 3 edges WHY".
+
+    Examples
+    --------
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(0, 0), (9, 0)], [(9, 0), (9, 9)]], crs="EPSG:32616")
+    >>> len(drop_edges(graph, np.array([True, False]), why="as an example").nodes)
+    2
+    """
+    if not dropped.any():
+        return graph
+    edges = graph.edges[~dropped]
+    lost = graph.edges.index[dropped]
+    turns = graph.turns[~(graph.turns["from_edge"].isin(lost) | graph.turns["to_edge"].isin(lost))]
+    logger.info("removed %d edges %s", len(lost), why)
+    nodes = _nodes_with_edges(graph.nodes, graph.edges, edges)
+    return replace(graph, nodes=nodes, edges=finish_edges(edges), turns=turns)
+
+
 def drop_small_components(graph: RoadGraph, *, min_length: float = 15.0) -> RoadGraph:
     """Drop connected components with a total length below ``min_length`` (m); turns on them go with them.
 
@@ -120,7 +150,7 @@ def drop_small_components(graph: RoadGraph, *, min_length: float = 15.0) -> Road
     adjacency = coo_array((np.ones(len(u), bool), (u, v)), shape=(n_nodes, n_nodes))
     _, component = connected_components(adjacency, directed=False) if n_nodes else (0, np.zeros(0, np.int64))
     total = np.bincount(component[u], weights=graph.edges["length"], minlength=n_nodes)
-    return _without_edges(graph, total[component[u]] < min_length, why=f"in components shorter than {min_length:g} m")
+    return drop_edges(graph, total[component[u]] < min_length, why=f"in components shorter than {min_length:g} m")
 
 
 def drop_dead_ends(graph: RoadGraph, *, min_length: float = 15.0) -> RoadGraph:
@@ -175,7 +205,7 @@ def drop_dead_ends(graph: RoadGraph, *, min_length: float = 15.0) -> RoadGraph:
         rank = np.arange(len(spur)) - np.searchsorted(junction, junction)  # shortest at its junction: 0
         dropped = (tips == 2) & (length < min_length)
         dropped[spur[rank < degree[junction] - 2]] = True
-        graph = _without_edges(graph, dropped, why=f"in dead ends shorter than {min_length:g} m")
+        graph = drop_edges(graph, dropped, why=f"in dead ends shorter than {min_length:g} m")
     return graph
 
 
@@ -329,18 +359,6 @@ def _network(graph: RoadGraph) -> Network:
         edge=np.arange(len(u)),
         weight=np.ones(len(graph.nodes), np.int64),
     )
-
-
-def _without_edges(graph: RoadGraph, dropped: NDArray[np.bool_], *, why: str) -> RoadGraph:
-    """Drop edges, the nodes that lose their last edge, and the turns on them; the graph itself where none is."""
-    if not dropped.any():
-        return graph
-    edges = graph.edges[~dropped]
-    lost = graph.edges.index[dropped]
-    turns = graph.turns[~(graph.turns["from_edge"].isin(lost) | graph.turns["to_edge"].isin(lost))]
-    logger.info("removed %d edges %s", len(lost), why)
-    nodes = _nodes_with_edges(graph.nodes, graph.edges, edges)
-    return replace(graph, nodes=nodes, edges=finish_edges(edges), turns=turns)
 
 
 def _nodes_with_edges(nodes: gpd.GeoDataFrame, before: pd.DataFrame, after: pd.DataFrame) -> gpd.GeoDataFrame:

@@ -17,7 +17,7 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from probe2road.clean import merge_degree_two_nodes
+from probe2road.clean import drop_edges, merge_degree_two_nodes
 from probe2road.errors import OptionError
 from probe2road.gap_links import (
     NO_NODE,
@@ -34,7 +34,7 @@ from probe2road.gap_links import (
 from probe2road.roadgraph import RoadGraph, finish_edges
 from probe2road.splitting import split_edges
 
-__all__ = ["GapOptions", "fill_gaps", "gap_weights", "prune_gaps"]
+__all__ = ["GapOptions", "drop_undriven", "fill_gaps", "gap_weights", "prune_gaps"]
 
 logger = logging.getLogger(__name__)
 
@@ -167,14 +167,43 @@ def prune_gaps(graph: RoadGraph, steps: pd.DataFrame, *, min_traces: int = 4) ->
     through = steps[steps["entered"].astype(bool) & steps["left"].astype(bool)]
     traces = through.groupby("edge")["trace_id"].nunique().reindex(graph.edges.index, fill_value=0)
     dropped = ((graph.edges["origin"] == "gap") & (traces < min_traces)).to_numpy()
-    if dropped.any():
-        edges = graph.edges[~dropped]
-        turns = graph.turns[graph.turns["from_edge"].isin(edges.index) & graph.turns["to_edge"].isin(edges.index)]
-        lost = np.setdiff1d(graph.edges[["u", "v"]], edges[["u", "v"]])
-        nodes = graph.nodes[~graph.nodes.index.isin(lost)]
-        graph = replace(graph, nodes=nodes, edges=finish_edges(edges), turns=turns)
-    logger.info("removed %d gap edges with fewer than %d traces", int(dropped.sum()), min_traces)
-    return merge_degree_two_nodes(graph)
+    why = f"of origin gap with fewer than {min_traces} traces"
+    return merge_degree_two_nodes(drop_edges(graph, dropped, why=why))
+
+
+def drop_undriven(graph: RoadGraph, steps: pd.DataFrame, *, min_traces: int = 1) -> RoadGraph:
+    """Remove edges that too few traces drove on: rungs between parallel roads, and lines that are no road.
+
+    Parameters
+    ----------
+    graph
+        Any road graph.
+    steps
+        Matched paths on that graph: `probe2road.mapmatch.Matches.steps`.
+    min_traces
+        Distinct traces that must be matched to an edge; 0 keeps all.
+
+    Returns
+    -------
+    RoadGraph
+        Not merged; turns on removed edges are dropped. The graph itself where every edge is driven.
+
+    Raises
+    ------
+    OptionError
+        If ``min_traces`` is negative.
+
+    Examples
+    --------
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(0, 0), (90, 0)], [(90, 0), (90, 8)]], crs="EPSG:32616")
+    >>> drop_undriven(graph, pd.DataFrame({"trace_id": [7], "edge": [0]})).edges.index.tolist()
+    [0]
+    """
+    if min_traces < 0:
+        raise OptionError(f"min_traces is {min_traces}", where="drop_undriven", fix="use a number that is not negative")
+    traces = steps.groupby("edge")["trace_id"].nunique().reindex(graph.edges.index, fill_value=0)
+    return drop_edges(graph, (traces < min_traces).to_numpy(), why=f"that fewer than {min_traces} traces drove on")
 
 
 def _chosen(ends: DeadEnds, links: Links, options: GapOptions) -> Links:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -126,7 +126,10 @@ def build(
     work.write_graph("5-cleaned", graph)
     report("graph", 1, 1)
     if options.refine:
-        graph = refine_graph(graph, fleet, options.refinement, clean=options.clean, work=work, report=report)
+        refinement = options.refinement
+        if refinement.move is None:  # a network has learned where the middle of a road is; traces keep to their lanes
+            refinement = replace(refinement, move=weights is None)
+        graph = refine_graph(graph, fleet, refinement, clean=options.clean, work=work, report=report)
     work.write_graph("7-roads", graph)
     return graph
 

@@ -1,8 +1,8 @@
 """Centreline refinement with the fleet's own drives: what the mask cannot say, the traces can.
 
 A raster knows neither whether two ends of roads with a gap between them are one road, nor whether two roads
-that cross also meet. Traces are matched to the graph three times: to tell which filled gaps are driven, to
-tell which junctions are real, and to say how often every edge and every turn was driven.
+that cross also meet. Traces are matched to the graph four times: to tell which filled gaps are driven, to tell
+which junctions are real, to drop what nobody drives, and to say how often every edge and every turn was driven.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from probe2road.disambiguate import DisambiguateOptions, split_false_junctions
 from probe2road.errors import OptionError
 from probe2road.evidence import EvidenceOptions, add_evidence
 from probe2road.fleet import Fleet
-from probe2road.gaps import GapOptions, fill_gaps, gap_weights, prune_gaps
+from probe2road.gaps import GapOptions, drop_undriven, fill_gaps, gap_weights, prune_gaps
 from probe2road.mapmatch import MatchOptions, match
 from probe2road.passages import passing_positions
 from probe2road.roadgraph import RoadGraph
@@ -32,9 +32,10 @@ class RefineOptions:
     gap_weight: float = 0.1  # of turning into a gap edge, where an edge of the segmentation has 1
     gaps: GapOptions = field(default_factory=GapOptions)  # which gaps are filled
     matching: MatchOptions = field(default_factory=MatchOptions)  # how traces are matched
+    min_support: int = 1  # traces that must drive on an edge for it to stay; 0 keeps all
     junctions: DisambiguateOptions = field(default_factory=DisambiguateOptions)  # which junctions are split
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)  # what counts as having driven an edge
-    move: bool = True  # whether edges move to the middle of what was driven
+    move: bool | None = None  # whether edges move to the middle of what was driven; None leaves it to the segmenter
     centreline: CentrelineOptions = field(default_factory=CentrelineOptions)  # how far they may
 
     def __post_init__(self) -> None:
@@ -88,21 +89,26 @@ def refine_graph(
     report = report or (lambda *_: None)
     if graph.edges.empty:
         return graph
-    report("matching", 0, 3)
+    report("matching", 0, 4)
     filled = fill_gaps(graph, options=options.gaps)
     matches = match(fleet, filled, options.matching, edge_weights=gap_weights(filled, gap=options.gap_weight))
     graph = clean_graph(prune_gaps(filled, matches.steps, min_traces=options.min_traces), clean)
     work.write_graph("6-gaps-filled", graph)
 
-    report("matching", 1, 3)
+    report("matching", 1, 4)
     matches = match(fleet, graph, options.matching)
     positions = passing_positions(fleet, matches, graph)
     graph = split_false_junctions(graph, matches.steps, positions=positions, options=options.junctions)
 
-    report("matching", 2, 3)
+    report("matching", 2, 4)
     matches = match(fleet, graph, options.matching)
+    driven = drop_undriven(graph, matches.steps, min_traces=options.min_support)
+    report("matching", 3, 4)
+    if driven is not graph:
+        graph = clean_graph(driven, clean)
+        matches = match(fleet, graph, options.matching)
     graph = add_evidence(graph, fleet, matches, options=options.evidence)
-    if options.move:
+    if options.move is not False:
         graph = refine_centreline(graph, fleet, matches, options=options.centreline)
-    report("matching", 3, 3)
+    report("matching", 4, 4)
     return graph
