@@ -129,6 +129,51 @@ def build(
 
 
 @app.command()
+def align(
+    traces: Annotated[list[Path], typer.Argument(help="Raw fleet data: files or folders.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file for the aligned traces.")],
+    points: Annotated[Path | None, typer.Option(help="Semantic points: a file or a folder.")] = None,
+    add_to: Annotated[Path | None, typer.Option(help="Aligned fleet data that the drives are added to.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Folder for figures, lists and a picture.")] = None,
+    columns: Columns = None,
+    point_columns: PointColumns = None,
+    crs: Crs = None,
+    bbox: Bbox = None,
+    delimiter: Delimiter = None,
+    no_header: NoHeader = False,
+    drop_rejected: Annotated[bool, typer.Option("--drop-rejected", help="Leave out what cannot be aligned.")] = False,
+    config: Annotated[Path | None, typer.Option(help="TOML file with alignment options.")] = None,
+    workers: Annotated[int, typer.Option(help="Processes; no influence on the result.")] = 1,
+) -> None:
+    """Align the drives of a fleet: move poses and points to where they agree.
+
+    An interrupted run goes on where it stopped when it is started again.
+    """
+    from probe2road.align import AlignOptions, add_drives
+    from probe2road.align import align as align_fleet
+    from probe2road.alignment.report import draw_alignment, write_report
+    from probe2road.io.fleet_reader import read_fleet
+    from probe2road.io.fleet_writer import write_fleet
+    from probe2road.options import load_options
+
+    options = load_options(config, AlignOptions) if config else AlignOptions()
+    options = replace(options, keep_rejected=False) if drop_rejected else options
+    base = read_fleet(add_to) if add_to else None
+    work_crs = base.crs.to_wkt() if base else None
+    fleet = _read_fleet(traces, points, columns, point_columns, crs, bbox, delimiter, no_header, work_crs)
+    workspace = output.parent / f".{output.name}.probe2road"
+    with _progress_bar() as progress:
+        kept: dict[str, Any] = {"workspace": workspace, "workers": workers, "progress": progress}
+        result = add_drives(base, fleet, options, **kept) if base else align_fleet(fleet, options, **kept)
+    write_fleet(result.fleet, output)
+    if report:
+        write_report(result.report, report)
+        draw_alignment(fleet, result.fleet, report / "alignment.png")
+    shutil.rmtree(workspace, ignore_errors=True)
+    typer.echo(json.dumps(result.report.summary, indent=1))
+
+
+@app.command()
 def match(
     traces: Annotated[Path, typer.Argument(help="Fleet data: a file or a folder.")],
     graph: Annotated[Path, typer.Argument(help="Road graph, in any format that build writes, or OSM.")],
@@ -293,6 +338,37 @@ def simulate(
             residual=ResidualModel() if aligned else None,
             progress=progress,
         )
+
+
+@app.command()
+def train(
+    config: Annotated[str, typer.Argument(help="TOML file, or a shipped one: gnss-vision, gnss, paper.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the run; a run in it goes on.")],
+    sets: Annotated[Path, typer.Option(help="Folder of prepared data sets, see benchmark prepare.")],
+    device: Annotated[str, typer.Option(help="cpu, cuda, or auto: cuda where there is one.")] = "auto",
+    threads: Annotated[int | None, typer.Option(help="Of the CPU; all cores without it.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Stop at the first validation after so long.")] = None,
+) -> None:
+    """Train the segmentation network and write its weights file, which build --weights takes.
+
+    An interrupted run goes on where it stopped when it is started again. Needs the extra 'train'.
+    """
+    from probe2road.training.config import load_config
+    from probe2road.training.finish import export_best
+    from probe2road.training.loop import is_first, use_threads
+    from probe2road.training.loop import train as run_training
+
+    chosen = load_config(config)
+    if threads is not None:
+        use_threads(threads)
+    stop_after = None if minutes is None else 60.0 * minutes
+    with _progress_bar() as progress:
+        state = run_training(chosen, output, sets=sets, device=device, stop_after=stop_after, progress=progress)
+    if not is_first():
+        return
+    if state.step < chosen.steps:
+        typer.echo(f"stopped after step {state.step} of {chosen.steps}; start again to go on")
+    typer.echo(export_best(chosen, state, output, sets=sets))
 
 
 @_benchmark.command()

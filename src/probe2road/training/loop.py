@@ -32,7 +32,7 @@ with needs_extra("train", feature="training the segmentation network"):
     from torch.nn.parallel import DistributedDataParallel
     from torch.utils.tensorboard import SummaryWriter
 
-__all__ = ["learning_rate", "predict_squares", "train", "use_threads"]
+__all__ = ["is_first", "learning_rate", "predict_squares", "train", "use_threads"]
 
 logger = logging.getLogger(__name__)
 
@@ -206,6 +206,11 @@ def use_threads(threads: int) -> None:
     if threads < 1:
         raise OptionError(f"threads is {threads}", fix="use 1 or more")
     torch.set_num_threads(threads)
+
+
+def is_first() -> bool:
+    """Say whether this process is the one that writes, of those that a launcher started."""
+    return os.environ.get("RANK", "0") == "0"
 
 
 def _join(device: str) -> tuple[torch.device, int, int]:
