@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from skimage.morphology import thin
 
 from probe2road.errors import InputError, OptionError
-from probe2road.skeleton import Method, skeleton_pixels, skeletonize, skeletonize_windows
+from probe2road.skeleton import FIXED, SET, Method, skeleton_pixels, skeletonize, skeletonize_windows, thin_state
 
 Mask = NDArray[np.bool_]
 
@@ -96,20 +96,6 @@ class TestSkeletonize:
         assert skeletonize(square).any()
         assert not skeletonize(square, method="zhang_suen").any()
 
-    @pytest.mark.parametrize("seed", range(4))
-    def test_fixed_pixels_stay(self, seed: int) -> None:
-        mask = random_mask(seed)
-        fixed = np.random.default_rng(seed).random(mask.shape) < 0.05
-        grown = skeletonize(mask, method="zhang_suen", fixed=fixed)
-        assert grown[fixed & mask].all()
-        assert not grown[~mask].any()
-
-    def test_road_is_thinned_onto_what_is_fixed_beside_its_middle(self) -> None:
-        road = mask_of(".......", ".#####.", ".#####.", ".#####.", ".......")
-        edge = mask_of(".......", ".......", ".......", ".#####.", ".......")
-        assert not (skeletonize(road) & edge).any()
-        assert skeletonize(road, fixed=edge).tolist() == edge.tolist()
-
     def test_any_number_but_zero_is_road_and_the_input_stays(self) -> None:
         mask = random_mask(2) * 255
         before = mask.copy()
@@ -125,10 +111,27 @@ class TestSkeletonize:
     def test_errors_name_the_fault(self) -> None:
         with pytest.raises(InputError, match="3 dimensions"):
             skeletonize(np.zeros((3, 4, 4)))
-        with pytest.raises(InputError, match="fixed has shape"):
-            skeletonize(np.zeros((4, 4)), fixed=np.zeros((4, 5), bool))
         with pytest.raises(OptionError, match="lee"):
             skeletonize(np.zeros((4, 4)), method="lee")  # type: ignore[arg-type]
+
+
+class TestThinState:
+    @pytest.mark.parametrize("seed", range(4))
+    def test_equals_thinning_the_mask_where_nothing_is_fixed(self, seed: int) -> None:
+        mask = np.pad(random_mask(seed), 1)
+        state = mask.astype(np.uint8) * SET
+        thin_state(state, method="zhang_suen")
+        np.testing.assert_array_equal(state == SET, skeletonize(mask, method="zhang_suen"))
+
+    @pytest.mark.parametrize("seed", range(4))
+    def test_fixed_pixels_stay_and_nothing_is_added(self, seed: int) -> None:
+        mask = np.pad(random_mask(seed), 1)
+        fixed = mask & (np.random.default_rng(seed).random(mask.shape) < 0.05)
+        state = np.where(fixed, FIXED, mask.astype(np.uint8) * SET)
+        thin_state(state)
+        assert (state[fixed] == FIXED).all()
+        assert not state[~mask].any()
+        assert set(np.unique(state)) <= {0, int(SET), int(FIXED)}
 
 
 class TestSkeletonizeWindows:

@@ -21,20 +21,19 @@ from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OptionError
 
-__all__ = ["skeleton_pixels", "skeletonize", "skeletonize_windows"]
+__all__ = ["FIXED", "SET", "skeleton_pixels", "skeletonize", "skeletonize_windows", "thin_state"]
 
 logger = logging.getLogger(__name__)
 
 Method = Literal["guo_hall", "zhang_suen"]
 
 _NO_LIMIT = 2**62  # iterations
-# Bits of a pixel's state.
+# Bits of a pixel's state. What is fixed is set, too.
 _SET, _QUEUED_FIRST, _QUEUED_SECOND, _FIXED = np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(8)
+SET, FIXED = _SET, _SET | _FIXED
 
 
-def skeletonize(
-    mask: NDArray[Any], *, method: Method = "guo_hall", fixed: NDArray[Any] | None = None
-) -> NDArray[np.bool_]:
+def skeletonize(mask: NDArray[Any], *, method: Method = "guo_hall") -> NDArray[np.bool_]:
     """Thin a mask to lines one pixel wide.
 
     With Guo-Hall connected parts stay connected, holes stay holes, and ends of lines are kept. Outside the mask
@@ -47,8 +46,6 @@ def skeletonize(
         Shape ``(rows, cols)``; everything that is not zero is road.
     method
         ``guo_hall``, or ``zhang_suen``, which can wear away diagonals and squares two pixels wide.
-    fixed
-        Pixels of the mask that stay whatever is around them, shape ``(rows, cols)``: a skeleton to grow.
 
     Returns
     -------
@@ -57,7 +54,7 @@ def skeletonize(
     Raises
     ------
     InputError
-        If the mask does not have two dimensions, or ``fixed`` has another shape.
+        If the mask does not have two dimensions.
     OptionError
         If the method is unknown.
 
@@ -75,12 +72,7 @@ def skeletonize(
            [0, 1, 1, 1, 1, 1, 0],
            [0, 0, 0, 0, 0, 0, 0]])
     """
-    rows, cols = _shape_of(mask)
-    state = _padded_state(mask, 0, 0, rows, cols, halo=0)
-    if fixed is not None:
-        if np.shape(fixed) != (rows, cols):
-            raise InputError(f"fixed has shape {np.shape(fixed)}, the mask {(rows, cols)}", fix="use the mask's shape")
-        state |= state * _FIXED * _padded_state(fixed, 0, 0, rows, cols, halo=0)
+    state = _padded_state(mask, 0, 0, *_shape_of(mask), halo=0)
     iterations = _thin(state, _deletion_table(method), _NO_LIMIT, 0)
     skeleton = (state[1:-1, 1:-1] & _SET).astype(bool)
     logger.debug("thinned a mask of %d x %d pixels in %d iterations", *skeleton.shape, iterations)
@@ -144,6 +136,35 @@ def skeletonize_windows(
         halo *= 2
         logger.info("the mask is wide: thinning again with a halo of %d pixels", halo)
     return out
+
+
+def thin_state(state: NDArray[np.uint8], *, method: Method = "guo_hall") -> None:
+    """Thin an image in place around pixels that stay, as skeletons do that grow level by level.
+
+    Parameters
+    ----------
+    state
+        Shape ``(rows, cols)``, C order: 0, `SET`, or `FIXED` for pixels that stay whatever is around them. The
+        outermost rows and columns have to be 0. Where large parts are 0, memory that was never written to stays so.
+    method
+        As for `skeletonize`.
+
+    Examples
+    --------
+    A road of three pixels is thinned onto its lower side, where a line is fixed:
+
+    >>> state = np.zeros((5, 6), np.uint8)
+    >>> state[1:4, 1:5] = SET
+    >>> state[3, 1:5] = FIXED
+    >>> thin_state(state)
+    >>> (state > 0).astype(int)
+    array([[0, 0, 0, 0, 0, 0],
+           [0, 0, 0, 0, 0, 0],
+           [0, 0, 0, 0, 0, 0],
+           [0, 1, 1, 1, 1, 0],
+           [0, 0, 0, 0, 0, 0]])
+    """
+    _thin(state, _deletion_table(method), _NO_LIMIT, 0)
 
 
 def skeleton_pixels(skeleton: NDArray[Any], *, strip: int = 4096) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -271,7 +292,7 @@ def _boundary(pixels: NDArray[np.uint8], around: NDArray[np.int64]) -> NDArray[n
     found = np.flatnonzero(pixels)  # the frame is background, so that every neighbourhood lies inside
     count = 0
     for pixel in found:
-        if _neighbourhood(pixels, pixel, around) != 255:
+        if _neighbourhood(pixels, int(pixel), around) != 255:
             found[count] = pixel
             pixels[pixel] |= _QUEUED_FIRST | _QUEUED_SECOND
             count += 1

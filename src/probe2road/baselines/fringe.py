@@ -24,7 +24,7 @@ __all__ = ["fringe_branches", "trace_fringe"]
 
 logger = logging.getLogger(__name__)
 
-_EMPTY, _LINE, _UNNUMBERED = -1, -2, -3  # kinds of pixels; those of a node have its number
+_EMPTY, _LINE, _UNNUMBERED = 0, -1, -2  # kinds of pixels; those of a node have its number plus one
 _STEP_ROW, _STEP_COL = (-1, 0, 1, 0, -1, -1, 1, 1), (0, 1, 0, -1, -1, 1, 1, -1)  # neighbours, those beside first
 
 
@@ -49,7 +49,9 @@ def fringe_branches(skeleton: NDArray[Any]) -> NDArray[np.int64]:
     [1, 1, 2, 2, 1, 1]
     """
     row, col = skeleton_pixels(skeleton)
-    return _branches(np.pad(skeleton != 0, 2), row + 2, col + 2)
+    padded = np.zeros((skeleton.shape[0] + 4, skeleton.shape[1] + 4), bool)
+    padded[row + 2, col + 2] = True
+    return _branches(padded, row + 2, col + 2)
 
 
 def trace_fringe(skeleton: NDArray[Any], *, min_length: float = 0.0) -> PixelGraph:
@@ -84,7 +86,7 @@ def trace_fringe(skeleton: NDArray[Any], *, min_length: float = 0.0) -> PixelGra
     """
     row, col = skeleton_pixels(skeleton)
     branches = fringe_branches(skeleton)
-    kind = np.full((skeleton.shape[0] + 2, skeleton.shape[1] + 2), _EMPTY, np.int32)
+    kind = np.zeros((skeleton.shape[0] + 2, skeleton.shape[1] + 2), np.int32)
     kind[row[branches == 2] + 1, col[branches == 2] + 1] = _LINE
     at_node = (branches == 1) | (branches > 2)
     node_row, node_col = _number_nodes(kind, row[at_node] + 1, col[at_node] + 1)
@@ -147,14 +149,14 @@ def _branches(padded: NDArray[np.bool_], row: NDArray[np.int64], col: NDArray[np
 def _number_nodes(
     kind: NDArray[np.int32], row: NDArray[np.int64], col: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Write the number of its node into every node pixel; return the nodes' means, rounded down."""
+    """Write the number of its node plus one into every node pixel; return the nodes' means, rounded down."""
     for pixel in range(len(row)):
         kind[row[pixel], col[pixel]] = _UNNUMBERED
     node_row, node_col = [0.0 for _ in range(0)], [0.0 for _ in range(0)]
     for pixel in range(len(row)):
         if kind[row[pixel], col[pixel]] != _UNNUMBERED:
             continue
-        number = len(node_row)
+        number = len(node_row) + 1
         kind[row[pixel], col[pixel]] = number
         members = [(row[pixel], col[pixel])]
         place = 0
@@ -186,7 +188,7 @@ def _burn(
     start, stop, sizes = [0 for _ in range(0)], [0 for _ in range(0)], [0 for _ in range(0)]
     path_row, path_col = [0.0 for _ in range(0)], [0.0 for _ in range(0)]
     for pixel in range(len(row)):
-        here = int(kind[row[pixel], col[pixel]])
+        here = int(kind[row[pixel], col[pixel]]) - 1
         for k in range(8):
             r, c = row[pixel] + _STEP_ROW[k], col[pixel] + _STEP_COL[k]
             if kind[r, c] != _LINE:
@@ -224,7 +226,7 @@ def _fire(kind: NDArray[np.int32], row: int, col: int, origin: int) -> tuple[int
         place = stack.pop()
         r, c = rows[place], cols[place]
         for k in range(8):
-            there = int(kind[r + _STEP_ROW[k], c + _STEP_COL[k]])
+            there = int(kind[r + _STEP_ROW[k], c + _STEP_COL[k]]) - 1
             if there >= 0 and there != origin:
                 while place >= 0:
                     way_row.append(rows[place])

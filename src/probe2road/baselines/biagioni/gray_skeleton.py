@@ -1,4 +1,11 @@
-"""The gray-scale skeleton: a density thinned level by level, from the busiest roads to the quietest."""
+"""The gray-scale skeleton: a density thinned level by level, from the busiest roads to the quietest.
+
+Strategy
+--------
+One image is thinned again and again. The pixels with any density are listed once, from the highest rank down, so that
+those of a level are the first of the list: they are set, thinned, and what is left is fixed. Nothing but the
+thinning itself looks at the whole image, and that writes to no pixel that was never set.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +14,7 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
-from probe2road.skeleton import skeletonize
+from probe2road.skeleton import FIXED, SET, skeleton_pixels, thin_state
 
 __all__ = ["gray_skeleton"]
 
@@ -49,23 +56,30 @@ def gray_skeleton(ranks: NDArray[np.uint8]) -> NDArray[np.uint8]:
     >>> gray_skeleton(np.minimum(ranks, 1))[:, 4]
     array([0, 0, 0, 0, 1, 0, 0, 0, 0], dtype=uint8)
     """
+    state = np.zeros((ranks.shape[0] + 2, ranks.shape[1] + 2), np.uint8)
+    pixels = state.reshape(-1)
+    row, col = skeleton_pixels(ranks)
+    order = np.argsort(ranks[row, col], kind="stable")[::-1]
+    row, col = row[order], col[order]
+    place, rank_of = (row + 1) * state.shape[1] + col + 1, ranks[row, col]
     skeleton = np.zeros(ranks.shape, np.uint8)
     for rank in range(int(ranks.max(initial=0)), 0, -1):
-        fixed = skeleton > 0
-        thinned = skeletonize(ranks >= rank, method="zhang_suen", fixed=fixed)
-        row, col = np.nonzero(thinned & ~fixed)
-        new = _neighbours(thinned, row, col) <= _POOL
+        above = int(np.searchsorted(-rank_of.astype(np.int64), -rank, side="right"))  # descending, hence the signs
+        pixels[place[:above]] |= SET
+        thin_state(state, method="zhang_suen")
+        new = np.flatnonzero(pixels[place[:above]] == SET)
+        pool = _neighbours(pixels, place[new], state.shape[1]) > _POOL
+        pixels[place[new[pool]]] = 0
+        new = new[~pool]
+        pixels[place[new]] = FIXED
         skeleton[row[new], col[new]] = rank
     logger.info("gray-scale skeleton of %d pixels", np.count_nonzero(skeleton))
     return skeleton
 
 
-def _neighbours(mask: NDArray[np.bool_], row: NDArray[np.int64], col: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Count the set neighbours of pixels."""
-    padded = np.pad(mask, 1)
-    count = np.zeros(len(row), np.int64)
-    for down in range(3):
-        for right in range(3):
-            if down != 1 or right != 1:
-                count += padded[row + down, col + right]
+def _neighbours(pixels: NDArray[np.uint8], place: NDArray[np.int64], cols: int) -> NDArray[np.int64]:
+    """Count the set neighbours of pixels of an image with so many columns."""
+    count = np.zeros(len(place), np.int64)
+    for step in (-cols - 1, -cols, -cols + 1, -1, 1, cols - 1, cols, cols + 1):
+        count += pixels[place + step] > 0
     return count

@@ -7,7 +7,7 @@ matcher's states are the straight pieces between vertices, driven one way or the
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import geopandas as gpd
 import numpy as np
@@ -62,9 +62,9 @@ def initial_map(skeleton: NDArray[np.uint8], grid: Grid, *, tolerance: float) ->
     -----
     METHOD 4.3. The published Douglas-Peucker loses the vertex where it cuts a line; this one does not.
     """
-    share = skeleton.astype(np.float32) / len(LEVELS)
     options = VectorizeOptions(smoothing=0.0, simplify_tolerance=tolerance)
-    return graph_from_pixels(trace_fringe(skeleton), grid, probability=share, options=options)
+    graph = graph_from_pixels(trace_fringe(skeleton), grid, probability=skeleton, options=options)
+    return replace(graph, edges=graph.edges.assign(score=graph.edges["score"] / len(LEVELS)))
 
 
 def straight_pieces(graph: RoadGraph) -> Pieces:
