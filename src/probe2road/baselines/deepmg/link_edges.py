@@ -10,6 +10,7 @@ import geopandas as gpd
 import numpy as np
 import pandas as pd
 import shapely
+from numpy.typing import NDArray
 
 from probe2road.baselines.deepmg.links import (
     NO_NODE,
@@ -62,7 +63,7 @@ def add_links(graph: RoadGraph, variant: Variant, options: LinkOptions | None = 
 
 
 def choose_links(
-    proposed: list[Link], degree: np.typing.NDArray[np.int64], *, min_angle: float, stretch: float = 1.0
+    proposed: list[Link], degree: NDArray[np.int64], *, min_angle: float, stretch: float = 1.0
 ) -> list[Link]:
     """Choose among links that end at one place in similar directions.
 

@@ -124,10 +124,12 @@ def propose_links(graph: RoadGraph, variant: Variant, options: LinkOptions | Non
     for end in _dead_ends(edges):
         square = shapely.box(*(end.place - options.radius), *(end.place + options.radius))
         near = [int(edge) for edge in sorted(tree.query(square)) if not _joins_same_nodes(edges, int(edge), end.edge)]
-        rule = _from_stub if edges.stub[end.edge] else _straight_on
-        found = [link for edge in near if (link := rule(edges, end, edge, stretch, options)) is not None]
-        found = [link for link in found if not _crosses(edges, end, link, near, variant)]
-        proposed += _distinct(found, stretch, options.min_angle)
+        if edges.stub[end.edge]:
+            found = [_from_stub(edges, end, edge, options) for edge in near]
+        else:
+            found = [_straight_on(edges, end, edge, stretch, options) for edge in near]
+        free = [link for link in found if link is not None and not _crosses(edges, end, link, near, variant)]
+        proposed += _distinct(free, stretch, options.min_angle)
     return proposed
 
 
@@ -193,9 +195,8 @@ def _straight_on(edges: _Edges, end: _End, edge: int, stretch: float, options: L
     return best
 
 
-def _from_stub(edges: _Edges, end: _End, edge: int, stretch: float, options: LinkOptions) -> Link | None:
+def _from_stub(edges: _Edges, end: _End, edge: int, options: LinkOptions) -> Link | None:
     """Link the end of an isolated stub to an edge beside it, where it is the nearer of its two ends."""
-    del stretch  # no angle is asked for
     distance, along = _foot(end.place, edges.vertices[edge], edges.along[edge])
     if distance < options.radius:
         nearer = distance < _foot(end.opposite, edges.vertices[edge], edges.along[edge])[0]

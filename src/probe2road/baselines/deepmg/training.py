@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -210,4 +209,4 @@ def _write_checkpoint(run: _Run, tiles: TileSet, folder: Path, options: TrainOpt
         torch.save(state, temporary)
     lines = [",".join(run.history[0]), *(",".join(f"{value:g}" for value in row.values()) for row in run.history)]
     with atomic_path(folder / "history.csv") as temporary:
-        temporary.write_text(os.linesep.join([*lines, ""]))
+        temporary.write_text("\n".join([*lines, ""]))
