@@ -1,0 +1,123 @@
+"""The paper's own baseline ("Woven"): kernel density estimation in three dimensions.
+
+Traces become a volume of counts, a Gaussian smooths it to a density, a threshold makes it binary, and the lines that
+three-dimensional thinning leaves are the roads.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from probe2road.baselines.volume import count_voxels, dense_pillars
+from probe2road.baselines.volume_graph import graph_from_volume
+from probe2road.baselines.volume_skeleton import thin_volume
+from probe2road.clean import CleanOptions, clean_graph
+from probe2road.errors import OptionError
+from probe2road.fleet import Fleet, TraceGaps
+from probe2road.raster import fleet_grid
+from probe2road.roadgraph import RoadGraph
+from probe2road.workspace import Progress, open_workspace
+
+__all__ = ["KdeOptions", "build_kde"]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class KdeOptions:
+    """The parameters, of which the paper publishes none.
+
+    The three that make the density were chosen by ``scripts/fit_kde.py``.
+    """
+
+    resolution: float = 1.0  # m, side of a voxel in plan
+    height: float = 3.0  # m, of a voxel
+    sigma: float = 1.5  # m, of the Gaussian in plan
+    sigma_vertical: float = 2.0  # m, of the Gaussian in height
+    threshold: float = 2.0  # traces on one line whose density is enough
+    gaps: TraceGaps = field(default_factory=TraceGaps)  # where traces are broken
+    simplify_tolerance: float = 1.0  # m, Douglas-Peucker
+    clean: CleanOptions | None = field(default_factory=CleanOptions)  # what counts as a flaw; None cleans nothing
+
+    def __post_init__(self) -> None:
+        """Refuse lengths and thresholds that are not positive."""
+        for name in ("resolution", "height", "sigma", "sigma_vertical", "threshold"):
+            if not getattr(self, name) > 0:
+                raise OptionError(f"{name} is {getattr(self, name)}", where="KDE", fix="use a number above 0")
+
+
+def build_kde(
+    fleet: Fleet,
+    options: KdeOptions | None = None,
+    *,
+    workspace: str | Path | None = None,
+    progress: Progress | None = None,
+) -> RoadGraph:
+    """Build a road graph with three-dimensional kernel density estimation; only traces are used.
+
+    Parameters
+    ----------
+    fleet
+        From `probe2road.read_fleet`. Fixes without altitude are left out, unless none has one.
+    options
+        The defaults where it is None.
+    workspace
+        Folder for what every stage makes. A run on the same fleet with the same options takes the result from it.
+        Nothing is written where it is None.
+    progress
+        Called as the work goes on.
+
+    Returns
+    -------
+    RoadGraph
+        In the fleet's CRS, with heights; empty where the density is too low. Nothing is matched, so there are neither
+        counts nor turns.
+
+    Raises
+    ------
+    InputError
+        If the fleet has no fixes.
+    OptionError
+        If an option makes no sense.
+
+    Notes
+    -----
+    Paper, section IV "Comparison to other methods"; METHOD 10, last point. Roads above each other stay apart where
+    their traces do.
+
+    Examples
+    --------
+    >>> from probe2road.demo import demo_fleet
+    >>> graph = build_kde(demo_fleet(n_drives=40))
+    >>> graph.length > 2000
+    True
+    """
+    options, report = options or KdeOptions(), progress or _silent
+    grid = fleet_grid(fleet, resolution=options.resolution)
+    work = open_workspace(workspace, fleet, options)
+    if (kept := work.read_graph("2-roads")) is not None:
+        return kept
+
+    report("density", 0, 1)
+    counts = count_voxels(fleet, grid, height=options.height, gaps=options.gaps)
+    pillars = dense_pillars(
+        counts, sigma=options.sigma, sigma_vertical=options.sigma_vertical, threshold=options.threshold
+    )
+    report("skeleton", 0, 1)
+    skeleton = thin_volume(pillars)
+    report("graph", 0, 1)
+    graph = graph_from_volume(
+        skeleton, grid, floor=counts.floor, height=counts.height, tolerance=options.simplify_tolerance
+    )
+    work.write_graph("1-vectorized", graph)
+    if options.clean is not None:
+        graph = clean_graph(graph, options.clean)
+    work.write_graph("2-roads", graph)
+    report("graph", 1, 1)
+    return graph
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    """Report nothing."""
