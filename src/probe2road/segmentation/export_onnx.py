@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 _INPUT, _OUTPUT = "counts", "probability"
 
 _TOLERANCE = 1e-3  # largest difference in probability between torch and the file
-_LARGE = 1024  # values; smaller initialisers stay in single precision, batch normalisation among them
+_LARGE = 1024  # values of a kernel that is stored in half precision; vectors, as of batch normalisation, never are
 _PREFIX = "network."  # what the wrapper puts before the names of parameters
 _SINGLE = ".single"  # what a stored initialiser is called behind its cast
 _UNUSED = "num_batches_tracked"  # of batch normalisation: counted in training, needed nowhere
@@ -188,7 +188,7 @@ def _halve(onnx_model: ModelProto) -> None:
     cast: dict[str, str] = {}
     for tensor in graph.initializer:
         values = onnx.numpy_helper.to_array(tensor)
-        if values.dtype == np.float32 and values.size >= _LARGE:
+        if values.dtype == np.float32 and values.ndim > 1 and values.size >= _LARGE:
             cast[tensor.name] = tensor.name + _SINGLE
             tensor.CopyFrom(onnx.numpy_helper.from_array(values.astype(np.float16), tensor.name))
     for node in graph.node:
@@ -220,5 +220,5 @@ def _round_large(model: nn.Module) -> None:
     """Round the large parameters of a model to half precision, in place."""
     with torch.no_grad():
         for parameter in model.parameters():
-            if parameter.numel() >= _LARGE:
+            if parameter.dim() > 1 and parameter.numel() >= _LARGE:
                 parameter.copy_(parameter.half().float())
