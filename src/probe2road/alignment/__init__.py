@@ -1,0 +1,1 @@
+"""Fleet alignment: noisy drives moved to where they agree."""

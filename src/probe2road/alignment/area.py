@@ -1,0 +1,295 @@
+"""The alignment of one area: the recipe, from recorded drives to poses that agree.
+
+Everything here is held in memory at once; `probe2road.alignment.tiling` cuts larger data into areas.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe2road.alignment.floors import Floors, find_floors, floor_of, registered_heights
+from probe2road.alignment.graph import optimise
+from probe2road.alignment.heights import solve_heights
+from probe2road.alignment.keyframes import Keyframes, Sightings, keyframes, sightings, wrapped
+from probe2road.alignment.lines import Condensed, Matches, condense, match_lines
+from probe2road.alignment.options import AlignOptions
+from probe2road.alignment.registration import Evidence, ShiftSearch, register
+from probe2road.alignment.spines import CELL, OnSpines, Spines, find_spines, project
+from probe2road.fleet import Fleet
+
+__all__ = ["AlignedArea", "align_area"]
+
+logger = logging.getLogger(__name__)
+
+_SEARCH_BIN = 0.25  # m, of the shifts tried in registration
+_SEARCH_KERNEL = 0.3  # m
+_SEARCH_DOUBT = 0.7  # keyframes
+_SEARCH_TEMPER = 0.25  # points of neighbouring keyframes see the same paint with the same camera
+_TRIAL_ROUNDS = 2  # before registration is repeated
+_LEAST_MOVE = 0.1  # m, by which a shift may change between keyframes, however near
+_LANE_GATE = 3.0  # lane sigmas beyond which a path does not belong to the middle of all
+
+
+@dataclass(frozen=True)
+class AlignedArea:
+    """Where the keyframes of an area are after alignment, and what it took.
+
+    Attributes
+    ----------
+    frames
+        The keyframes as recorded.
+    pose
+        Aligned poses, m, m, radians, shape ``(k, 3)``.
+    z
+        Aligned heights, m, shape ``(k,)``.
+    sights
+        Points of each keyframe that lie on lines which others saw too, shape ``(k,)``.
+    residual
+        Of the matched points in the last round, m, shape ``(m,)``; their keyframes and what they would have been
+        without alignment, shape ``(m,)`` each.
+    rounds
+        Median absolute residual of each round, m.
+    """
+
+    frames: Keyframes
+    pose: NDArray[np.float64]
+    z: NDArray[np.float64]
+    sights: NDArray[np.int64]
+    residual: NDArray[np.float64]
+    residual_keyframe: NDArray[np.int64]
+    residual_before: NDArray[np.float64]
+    rounds: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What does not change while an area is aligned."""
+
+    frames: Keyframes
+    seen: Sightings
+    held: NDArray[np.bool_]  # (k,) keyframes that stay
+    order: NDArray[np.int64]  # chains, best first
+    options: AlignOptions
+
+
+def align_area(fleet: Fleet, options: AlignOptions, *, held: NDArray[np.bool_] | None = None) -> AlignedArea:
+    """Align the drives of one area.
+
+    Parameters
+    ----------
+    fleet
+        The drives, at least one; none of those that `probe2road.alignment.screening.screen_drives` rejects.
+    options
+        How.
+    held
+        Drives that are aligned already and must not move, shape ``(n_traces,)``.
+
+    Returns
+    -------
+    AlignedArea
+    """
+    frames = keyframes(fleet, options)
+    held = np.zeros(fleet.n_traces, bool) if held is None else held
+    scene = _Scene(frames, sightings(fleet, frames), held[frames.drive], _best_first(frames), options)
+    pose = optimise(frames, frames.pose, _nothing(), np.zeros((0, 3)), options, held=scene.held)
+    # Drives that were too far off to be found the first time are nearer the second time.
+    for gates in (options.gates[:_TRIAL_ROUNDS], options.gates):
+        spines = find_spines(replace(frames, pose=pose), _held_first(scene), options)
+        pose, floors, height = _register(scene, pose, spines)
+        pose, matches, rounds = _iterate(scene, pose, spines, floors, height, gates)
+    on = project(spines, pose, options)
+    floor = floor_of(floors, on.cell, height, options)
+    z = solve_heights(frames, floor, spines.z[np.maximum(on.station, 0)], options, held=scene.held)
+    return _result(scene, pose, z, spines, matches, rounds)
+
+
+def _iterate(
+    scene: _Scene,
+    pose: NDArray[np.float64],
+    spines: Spines,
+    floors: Floors,
+    height: NDArray[np.float64],
+    gates: tuple[float, ...],
+) -> tuple[NDArray[np.float64], Matches, list[float]]:
+    """Match and optimise in turn until the residuals stay as they are: poses, last matches, residual by round."""
+    rounds: list[float] = []
+    for gate in gates:
+        pose, matches = _round(scene, pose, spines, floors, height, gate)
+        rounds.append(float(np.median(np.abs(matches.residual))) if len(matches.residual) else 0.0)
+        if len(rounds) > 1 and gate == min(gates) and abs(rounds[-2] - rounds[-1]) < scene.options.converged:
+            break
+    return pose, matches, rounds
+
+
+def _best_first(frames: Keyframes) -> NDArray[np.int64]:
+    """Chains by what they believe of their accuracy, and by length."""
+    starts = frames.starts
+    n = np.diff(starts)
+    return np.lexsort((-n, np.round(np.add.reduceat(frames.sigma, starts[:-1]) / n, 1)))
+
+
+def _held_first(scene: _Scene) -> NDArray[np.int64]:
+    held = scene.held[scene.frames.starts[:-1]]
+    return np.concatenate([scene.order[held[scene.order]], scene.order[~held[scene.order]]])
+
+
+def _nothing() -> Condensed:
+    none = np.zeros(0, np.int64)
+    return Condensed(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)))
+
+
+def _points_on_spines(scene: _Scene, pose: NDArray[np.float64], spines: Spines) -> OnSpines:
+    """Project all points, each with the direction of its keyframe."""
+    x, y, theta = pose[scene.seen.keyframe].T
+    ahead, left = scene.seen.body.T
+    cos, sin = np.cos(theta), np.sin(theta)
+    world = np.column_stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left, theta])
+    return project(spines, world, scene.options)
+
+
+def _register(
+    scene: _Scene, pose: NDArray[np.float64], spines: Spines
+) -> tuple[NDArray[np.float64], Floors, NDArray[np.float64]]:
+    """Bring drives onto one another, first in height, then across the road: poses, floors, heights over the spines."""
+    frames, options = scene.frames, scene.options
+    chain_held = scene.held[frames.starts[:-1]]
+    on = project(spines, pose, options)
+    height = registered_heights(frames, on, spines, scene.order, options, chain_held)
+    floors = find_floors(on, height, spines, options)
+    home = floor_of(floors, on.cell, height, options)
+    if len(scene.seen.keyframe) == 0 or len(floors.cell) == 0:
+        return pose, floors, height
+    points = _points_on_spines(scene, pose, spines)
+    floor = floor_of(floors, points.cell, height[scene.seen.keyframe], options)
+    found = floor >= 0
+    seen = Evidence(scene.seen.keyframe[found], floor[found], points.left[found], scene.seen.kind[found])
+    angle = spines.station[np.maximum(on.station, 0), 2]
+    shift = register(
+        seen, floors.places, frames.starts, scene.order, home, on.left,
+        np.cos(angle) * (frames.pose[:, 1] - pose[:, 1]) - np.sin(angle) * (frames.pose[:, 0] - pose[:, 0]),
+        np.maximum(frames.motion_sigma[:, 1], _LEAST_MOVE), np.sqrt(2.0) * frames.sigma * frames.inflation(options),
+        ShiftSearch(
+            options.search, _SEARCH_BIN, options.search + 20.0, _SEARCH_KERNEL, _SEARCH_DOUBT, _SEARCH_TEMPER
+        ), held=chain_held,
+    )  # fmt: skip
+    moved = pose.copy()
+    moved[:, 0] -= np.where(home >= 0, shift * np.sin(angle), 0.0)
+    moved[:, 1] += np.where(home >= 0, shift * np.cos(angle), 0.0)
+    return moved, floors, height
+
+
+def _round(
+    scene: _Scene,
+    pose: NDArray[np.float64],
+    spines: Spines,
+    floors: Floors,
+    height: NDArray[np.float64],
+    gate: float,
+) -> tuple[NDArray[np.float64], Matches]:
+    """Match points to lines and optimise: new poses, and the matches that led to them."""
+    options, frame = scene.options, scene.seen.keyframe
+    points = _points_on_spines(scene, pose, spines)
+    floor = floor_of(floors, points.cell, height[frame], options)
+    matches = match_lines(
+        floor, points.along, points.left, scene.seen.kind, scene.frames.drive[frame], options, gate=gate
+    )
+    at = matches.point
+    patch = floors.patch
+    sigma = np.where(scene.seen.kind[at] == 0, options.marking_sigma, options.boundary_sigma)
+    sights = condense(
+        matches, frame[at], patch[floor[at]], scene.seen.body[at],
+        spines.station[points.station[at], 2] - pose[frame[at], 2], sigma, gate=gate,
+    )  # fmt: skip
+    paths = _paths(scene, pose, spines, floors, height, np.unique(sights.keyframe))
+    both = Condensed(*(np.concatenate(pair) for pair in zip(_fields(sights), _fields(paths), strict=True)))
+    held_patches = np.zeros(len(patch), bool)
+    held_patches[patch[floor[at]][scene.held[frame[at]]]] = True
+    centre = _patch_poses(spines, floors)
+    moved = optimise(scene.frames, pose, both, centre, options, held=scene.held, fixed_patch=held_patches)
+    return moved, matches
+
+
+def _fields(condensed: Condensed) -> tuple[NDArray[np.generic], ...]:
+    return condensed.keyframe, condensed.patch, condensed.correction, condensed.information
+
+
+def _paths(
+    scene: _Scene,
+    pose: NDArray[np.float64],
+    spines: Spines,
+    floors: Floors,
+    height: NDArray[np.float64],
+    sighted: NDArray[np.int64],
+) -> Condensed:
+    """Attract drives whose camera saw nothing to the middle of all paths: weakly, because lanes differ."""
+    options = scene.options
+    on = project(spines, pose, options)
+    floor = floor_of(floors, on.cell, height, options)
+    blind = floor >= 0
+    chain = scene.frames.chain
+    blind &= ~np.isin(chain, chain[sighted])
+    if not blind.any():
+        return _nothing()
+    usable = floor >= 0
+    middle, drives = _middles(floor[usable], on.left[usable], scene.frames.drive[usable], len(floors.cell))
+    sigma = options.lane_sigma * scene.frames.inflation(options)
+    off = on.left - np.where(usable, middle[floor], 0.0)
+    k = np.flatnonzero(blind & (drives[floor] >= options.min_drives) & (np.abs(off) < _LANE_GATE * options.lane_sigma))
+    floor = floor[k]
+    angle = spines.station[on.station[k], 2] - pose[k, 2]
+    normal = np.column_stack([-np.sin(angle), np.cos(angle), np.zeros(len(k))])
+    information = normal[:, :, None] * normal[:, None, :] / sigma[k, None, None] ** 2 + np.diag([1e-6, 1e-6, 1e-4])
+    return Condensed(k, floors.patch[floor], -normal * off[k, None], information)
+
+
+def _middles(
+    floor: NDArray[np.int64], left: NDArray[np.float64], drive: NDArray[np.int64], n: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Median offset of the paths on each floor (n,), and how many drives there are (n,)."""
+    order = np.lexsort((left, floor))
+    count = np.bincount(floor, minlength=n)
+    middle = np.zeros(n)
+    start = np.cumsum(count) - count
+    there = count > 0
+    ranked = left[order]
+    low, high = start[there] + (count[there] - 1) // 2, start[there] + count[there] // 2
+    middle[there] = (ranked[low] + ranked[high]) / 2.0
+    span = int(drive.max(initial=0)) + 1
+    return middle, np.bincount(np.unique(floor * span + drive) // span, minlength=n)
+
+
+def _patch_poses(spines: Spines, floors: Floors) -> NDArray[np.float64]:
+    """Pose of the spine at the cell of each floor: shape ``(floors, 3)``."""
+    station = np.searchsorted(spines.along, (floors.cell + 0.5) * CELL)
+    return spines.station[np.clip(station, 0, len(spines.station) - 1)]
+
+
+def _result(
+    scene: _Scene,
+    pose: NDArray[np.float64],
+    z: NDArray[np.float64],
+    spines: Spines,
+    matches: Matches,
+    rounds: list[float],
+) -> AlignedArea:
+    """Put the result together; what residuals were before is measured against the same lines."""
+    frames, at = scene.frames, matches.point
+    keyframe = scene.seen.keyframe[at]
+    sights = np.bincount(keyframe, minlength=len(frames.row))
+    before = np.zeros(len(at))
+    if len(at):
+        points = _points_on_spines(scene, pose, spines)
+        angle = spines.station[np.maximum(points.station[at], 0), 2] + matches.slope
+        moved = frames.pose[keyframe] - pose[keyframe]
+        x, y = scene.seen.body[at].T
+        turn = wrapped(moved[:, 2])
+        cos, sin = np.cos(pose[keyframe, 2]), np.sin(pose[keyframe, 2])
+        # A turn of the keyframe moves what lies ahead of it sideways.
+        dx = moved[:, 0] - turn * (sin * x + cos * y)
+        dy = moved[:, 1] + turn * (cos * x - sin * y)
+        before = matches.residual - np.sin(angle) * dx + np.cos(angle) * dy
+    return AlignedArea(frames, pose, z, sights, matches.residual, keyframe, before, tuple(rounds))

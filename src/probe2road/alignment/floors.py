@@ -1,0 +1,139 @@
+"""Floors: which roads lie above each other, so that stacked roads never attract each other.
+
+Strategy
+--------
+Raw heights are off by metres, as much as two decks of a bridge are apart, but their errors change slowly. So heights
+are first registered like lateral positions, drive after drive, with a weight so small that agreement with another
+drive never outweighs several metres of GNSS height: a drive on a deck of its own stays there. Then the heights at each
+place fall into groups with a gap between them, and every group is a floor. All later stages work on floors; a spine
+with two decks has two at each of its cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe2road.alignment.keyframes import Keyframes
+from probe2road.alignment.options import AlignOptions
+from probe2road.alignment.registration import Evidence, Places, ShiftSearch, register
+from probe2road.alignment.spines import OnSpines, Spines
+
+__all__ = ["VERTICAL", "Floors", "find_floors", "floor_of", "registered_heights"]
+
+VERTICAL = 1.6  # vertical over horizontal error of GNSS under open sky
+_PERSUASION = 3.0  # weight of all heights that a drive shares with others, in observations
+_LOOK_AHEAD = 4  # cells ahead of a keyframe in which it sees things, and one behind
+_FAR = 10_000.0  # m, more than any height
+
+
+@dataclass(frozen=True)
+class Floors:
+    """F floors, sorted by cell and height."""
+
+    cell: NDArray[np.int64]  # (f,)
+    height: NDArray[np.float64]  # (f,) m above the spine
+    places: Places  # the floors behind and ahead that a vehicle drives to
+
+    @property
+    def patch(self) -> NDArray[np.int64]:
+        """Floor that stands for each floor and the next: shape ``(f,)``."""
+        own = np.arange(len(self.cell))
+        return np.where((self.cell % 2 == 1) & (self.places.before >= 0), self.places.before, own)
+
+
+def registered_heights(
+    frames: Keyframes,
+    on: OnSpines,
+    spines: Spines,
+    order: NDArray[np.int64],
+    options: AlignOptions,
+    held: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Height of every keyframe above its spine, m, drives brought together; NaN where it is not known.
+
+    Where no drive has heights all are 0.
+    """
+    if not np.isfinite(frames.z).any():
+        return np.zeros(len(frames.z))
+    raw = np.where(on.station >= 0, frames.z - spines.z[np.maximum(on.station, 0)], np.nan)
+    known = np.flatnonzero(np.isfinite(raw))
+    kind = np.zeros(len(known), np.int8)
+    persuasion = _PERSUASION * options.keyframe_spacing / options.gnss_length
+    length = np.diff(frames.distance, prepend=frames.distance[:1])
+    shift = register(
+        Evidence(known, on.cell[known], raw[known], kind),
+        Places.from_roads(spines.cell_spine), frames.starts, order, on.cell, np.nan_to_num(raw),
+        np.zeros(len(raw)),
+        np.maximum(options.height_share * length, 0.1),
+        VERTICAL * frames.sigma * frames.inflation(options),
+        ShiftSearch(options.height_search, 0.5, 3.0 * options.height_search, 0.7, 0.7, persuasion), held=held,
+    )  # fmt: skip
+    return raw + shift
+
+
+def find_floors(on: OnSpines, height: NDArray[np.float64], spines: Spines, options: AlignOptions) -> Floors:
+    """Group the heights at every cell.
+
+    Parameters
+    ----------
+    on
+        Keyframes on the spines.
+    height
+        Of each keyframe above its spine, m; NaN where unknown. Shape ``(k,)``.
+    spines
+        The spines.
+    options
+        Heights with a gap of more than the altitude gate between them are different floors.
+
+    Returns
+    -------
+    Floors
+    """
+    usable = np.flatnonzero((on.cell >= 0) & np.isfinite(height))
+    reach = np.arange(-1, _LOOK_AHEAD + 1)
+    cell = (on.cell[usable][:, None] + reach).ravel()
+    road = np.repeat(spines.cell_spine[on.cell[usable]], len(reach))
+    inside = (cell >= 0) & (cell < spines.n_cells)
+    inside[inside] &= spines.cell_spine[cell[inside]] == road[inside]
+    cell, at = cell[inside], np.repeat(height[usable], len(reach))[inside]
+    order = np.lexsort((at, cell))
+    cell, at = cell[order], at[order]
+    new = (np.diff(cell, prepend=-1) != 0) | (np.diff(at, prepend=-_FAR) > options.altitude_gate)
+    group = np.cumsum(new) - 1
+    middle = np.bincount(group, weights=at) / np.bincount(group) if len(group) else np.zeros(0)
+    cells = cell[new]
+    floors = Floors(cells, middle, Places(np.full(len(cells), -1), np.full(len(cells), -1)))
+    linked = {}
+    for name, step in (("before", -1), ("after", 1)):
+        neighbour = np.clip(cells + step, 0, spines.n_cells - 1)
+        same = spines.cell_spine[neighbour] == spines.cell_spine[cells] if len(cells) else np.zeros(0, bool)
+        found = floor_of(floors, neighbour, middle, options)
+        linked[name] = np.where(same & (neighbour != cells), found, -1)
+    return Floors(cells, middle, Places(**linked))
+
+
+def floor_of(
+    floors: Floors, cell: NDArray[np.int64], height: NDArray[np.float64], options: AlignOptions
+) -> NDArray[np.int64]:
+    """Find the floor of positions by cell and height.
+
+    Returns
+    -------
+    ndarray of int64, shape (n,)
+        -1 where there is none within twice the altitude gate; an unknown height fits where there is only one.
+    """
+    if len(floors.cell) == 0:
+        return np.full(len(cell), -1, np.int64)
+    key = floors.cell * (4.0 * _FAR) + floors.height
+    wanted = cell * (4.0 * _FAR) + np.nan_to_num(height)
+    after = np.clip(np.searchsorted(key, wanted), 1, max(len(key) - 1, 1)) if len(key) > 1 else np.zeros(len(cell), int)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(np.abs(key[after] - wanted) < np.abs(key[before] - wanted), after, before)
+    fits = floors.cell[nearest] == cell
+    unknown = ~np.isfinite(height)
+    alone = np.bincount(floors.cell, minlength=int(cell.max(initial=0)) + 1)[np.maximum(cell, 0)] == 1
+    near = np.abs(floors.height[nearest] - np.nan_to_num(height)) <= 2.0 * options.altitude_gate
+    return np.where((cell >= 0) & fits & np.where(unknown, alone, near), nearest, -1)

@@ -1,0 +1,254 @@
+"""From traces to keyframes: the poses that the factor graph moves, the motion between them, and what was seen there.
+
+Strategy
+--------
+Distance and direction are worked out for every fix at once. A keyframe is the first fix in each stretch of so many
+metres; a chain is the keyframes of one drive without a gap. There is no odometry in the data, so the motion between
+two keyframes is taken twice: from the positions, which follow the filter of the vehicle, and by dead reckoning from
+heading and speed. The mean is used, and where the two disagree, as in a multipath burst or a queue, the motion is
+trusted by no more than their difference. Points are fixed to the nearest keyframe of their chain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe2road.alignment.options import AlignOptions
+from probe2road.alignment.screening import rows_of_points
+from probe2road.fleet import POINT_KINDS, Fleet, trace_breaks
+
+__all__ = ["Keyframes", "Sightings", "fixes_course", "keyframes", "sightings", "wrapped"]
+
+_COURSE_STEP = 2.0  # m; shorter steps leave the course as it was
+_UNKNOWN_SHARE = 0.02  # of the distance, 1 sigma of the motion, where dead reckoning cannot check it
+_TURN_SHARE = 0.15  # of distance times turn (radians), 1 sigma: what lies between sparse fixes on a bend is not known
+_FIRST_SIGMA = 0.02  # m, of the motion, however short
+
+
+@dataclass(frozen=True)
+class Keyframes:
+    """K keyframes of the fixes of a fleet, in the order of the fixes.
+
+    Angles are radians counter-clockwise from east. A motion belongs to the keyframe that it ends at; it means nothing
+    at the first of a chain.
+    """
+
+    row: NDArray[np.int64]  # (k,) fix
+    drive: NDArray[np.int64]  # (k,) ordinal of the trace
+    chain: NDArray[np.int64]  # (k,) ordinal of the unbroken piece
+    distance: NDArray[np.float64]  # (k,) m driven; ascending over all drives
+    pose: NDArray[np.float64]  # (k, 3) m, m, radians, as recorded
+    z: NDArray[np.float64]  # (k,) m, NaN where unknown
+    sigma: NDArray[np.float64]  # (k,) m, of one horizontal axis of the recorded position
+    motion: NDArray[np.float64]  # (k, 3) m forward, m to the left, radians: from the keyframe before
+    motion_sigma: NDArray[np.float64]  # (k, 3)
+    fix_distance: NDArray[np.float64]  # (n,) the same for every fix
+
+    @property
+    def starts(self) -> NDArray[np.int64]:
+        """Keyframe at which each chain starts, then their number: shape ``(chains + 1,)``."""
+        first = np.flatnonzero(np.diff(self.chain, prepend=-1))
+        return np.append(first, len(self.chain))
+
+    def inflation(self, options: AlignOptions) -> NDArray[np.float64]:
+        """Factor on the sigma of whatever has errors that neighbours share, so that all together count once: (k,)."""
+        # A keyframe stands for the road to the next one; sparse fixes share less.
+        step = np.diff(self.distance, append=self.distance[-1:])
+        return np.sqrt(options.gnss_length / np.clip(step, options.keyframe_spacing / 2.0, options.gnss_length))
+
+    @property
+    def first(self) -> NDArray[np.bool_]:
+        """Whether a keyframe is the first of its chain: shape ``(k,)``."""
+        return np.diff(self.chain, prepend=-1) > 0
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """P points fixed to keyframes, in the order of these."""
+
+    keyframe: NDArray[np.int64]  # (p,)
+    body: NDArray[np.float64]  # (p, 2) m forward and to the left of the keyframe
+    kind: NDArray[np.int8]  # (p,) index into POINT_KINDS
+
+
+def wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Bring angles into -pi to pi."""
+    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi, np.float64)
+
+
+def keyframes(fleet: Fleet, options: AlignOptions) -> Keyframes:
+    """Choose the keyframes of a fleet and measure the motion between them.
+
+    Parameters
+    ----------
+    fleet
+        The fleet; every trace gives a keyframe or more.
+    options
+        Says how far apart they are and how well motion is known.
+
+    Returns
+    -------
+    Keyframes
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from probe2road.fleet import fleet_from_tables
+    >>> table = pd.DataFrame({"trace_id": 1, "t": range(11), "x": 446e3 + 10.0 * np.arange(11), "y": 4636e3})
+    >>> frames = keyframes(fleet_from_tables(table, crs="EPSG:32616"), AlignOptions(keyframe_spacing=50.0))
+    >>> frames.distance.tolist(), frames.motion[1].tolist()
+    ([0.0, 50.0, 100.0], [50.0, 0.0, 0.0])
+    """
+    traces, starts = fleet.traces, fleet.starts
+    xy = traces[["x", "y"]].to_numpy(np.float64)
+    breaks = trace_breaks(fleet)
+    theta = fixes_course(fleet, breaks)
+    reckoned = _dead_reckoning(fleet, theta, breaks)
+    step = np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)
+    known = np.isfinite(reckoned).all(axis=1)
+    # While a vehicle stands its position wanders; its wheels do not turn.
+    step = np.where(known, np.minimum(step, np.hypot(*np.nan_to_num(reckoned).T) + 0.1 * step), step)
+    step[breaks] = 0.0
+    distance = np.cumsum(step)
+
+    chain = np.cumsum(breaks) - 1
+    chosen = _chosen(distance, chain, options.keyframe_spacing)
+    row = np.flatnonzero(chosen)
+    pose = np.column_stack([xy[row], theta[row]])
+    motion, sigma = _motions(pose, distance[row], reckoned, row, chain[row], options)
+    accuracy = traces["accuracy"].to_numpy(np.float64) if "accuracy" in traces else np.full(len(traces), np.nan)
+    drive = np.repeat(np.arange(fleet.n_traces), np.diff(starts))
+    return Keyframes(
+        row, drive[row], chain[row], distance[row], pose, traces["z"].to_numpy(np.float64)[row],
+        np.where(accuracy > 0, accuracy, options.gnss_sigma)[row], motion, sigma, distance,
+    )  # fmt: skip
+
+
+def sightings(fleet: Fleet, frames: Keyframes) -> Sightings:
+    """Fix the points of a fleet to the keyframes nearest along their drives.
+
+    Points that no fix accounts for are left out.
+    """
+    rows = rows_of_points(fleet)
+    seen = np.flatnonzero(rows >= 0)
+    rows = rows[seen]
+    frame = _nearest_keyframe(frames, rows)
+    order = np.argsort(frame, kind="stable")
+    seen, frame = seen[order], frame[order]
+    world = fleet.points[["x", "y"]].to_numpy(np.float64)[seen]
+    x, y, theta = frames.pose[frame].T
+    east, north, cos, sin = world[:, 0] - x, world[:, 1] - y, np.cos(theta), np.sin(theta)
+    body = np.column_stack([cos * east + sin * north, cos * north - sin * east])
+    kind = fleet.points["kind"].cat.set_categories(POINT_KINDS).cat.codes.to_numpy(np.int8)[seen]
+    return Sightings(frame, body, kind)
+
+
+def fixes_course(fleet: Fleet, breaks: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Direction of travel at every fix: the recorded heading, or where there is none, that of the positions.
+
+    Parameters
+    ----------
+    fleet
+        The fleet.
+    breaks
+        Fixes that no motion leads to, shape ``(n,)``.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Radians counter-clockwise from east. A standing vehicle keeps its direction.
+    """
+    traces = fleet.traces
+    xy = traces[["x", "y"]].to_numpy(np.float64)
+    n = len(xy)
+    before = np.maximum(np.arange(n) - 1, 0)
+    after = np.minimum(np.arange(n) + 1, n - 1)
+    before[breaks] = np.flatnonzero(breaks)
+    ends = np.append(breaks[1:], True)
+    after[ends] = np.flatnonzero(ends)
+    leg = xy[after] - xy[before]
+    course = np.arctan2(leg[:, 1], leg[:, 0])
+    moving = np.hypot(*leg.T) >= _COURSE_STEP
+    chain = np.cumsum(breaks) - 1
+    # The last moving fix before, or else the first behind, within the chain.
+    last = np.maximum.accumulate(np.where(moving, np.arange(n), -1))
+    following = np.minimum.accumulate(np.where(moving, np.arange(n), n - 1)[::-1])[::-1]
+    source = np.where((last >= 0) & (chain[last] == chain), last, following)
+    course = course[np.where(chain[source] == chain, source, np.arange(n))]
+    if "heading" not in traces:
+        return course
+    heading = np.pi / 2.0 - np.radians(traces["heading"].to_numpy(np.float64))
+    return wrapped(np.where(np.isfinite(heading), heading, course))
+
+
+def _chosen(distance: NDArray[np.float64], chain: NDArray[np.int64], spacing: float) -> NDArray[np.bool_]:
+    """Choose the first and last fix of each chain, and the first in each stretch of the spacing."""
+    first = np.flatnonzero(np.diff(chain, prepend=-1))
+    stretch = np.floor((distance - distance[first][chain]) / spacing + 1e-9)
+    chosen = np.diff(stretch, prepend=-1.0) != 0
+    chosen[first] = True
+    chosen[np.append(first[1:], len(chain)) - 1] = True
+    return chosen
+
+
+def _dead_reckoning(fleet: Fleet, theta: NDArray[np.float64], breaks: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Motion (n, 2) from the fix before, m east and north, by heading and speed; NaN where they are not known."""
+    traces = fleet.traces
+    motion = np.full((len(traces), 2), np.nan)
+    if "speed" not in traces or "heading" not in traces:
+        return motion
+    speed = traces["speed"].to_numpy(np.float64)
+    interval = np.diff(traces["t"].to_numpy("datetime64[ns]"), prepend=np.datetime64("NaT", "ns"))
+    seconds = interval / np.timedelta64(1, "s")
+    length = (speed + np.roll(speed, 1)) / 2.0 * seconds
+    middle = theta - wrapped(theta - np.roll(theta, 1)) / 2.0
+    motion[:, 0], motion[:, 1] = length * np.cos(middle), length * np.sin(middle)
+    motion[breaks] = np.nan
+    return motion
+
+
+def _motions(
+    pose: NDArray[np.float64],
+    distance: NDArray[np.float64],
+    reckoned: NDArray[np.float64],
+    row: NDArray[np.int64],
+    chain: NDArray[np.int64],
+    options: AlignOptions,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Motion to each keyframe from the one before, in the frame of that one, and its sigmas: (k, 3) each."""
+    total = np.vstack([np.zeros(2), np.cumsum(np.nan_to_num(reckoned), axis=0)])
+    unknown = np.concatenate([[0], np.cumsum(~np.isfinite(reckoned).all(axis=1))])
+    before = np.maximum(np.arange(len(row)) - 1, 0)
+    moved = pose[:, :2] - pose[before, :2]
+    integrated = total[row + 1] - total[row[before] + 1]
+    has_both = unknown[row + 1] == unknown[row[before] + 1]
+    integrated = np.where(has_both[:, None], integrated, moved)
+    cos, sin = np.cos(pose[before, 2]), np.sin(pose[before, 2])
+    both = [
+        np.column_stack([cos * leg[:, 0] + sin * leg[:, 1], cos * leg[:, 1] - sin * leg[:, 0]])
+        for leg in (moved, integrated)
+    ]
+    turn = wrapped(pose[:, 2] - pose[before, 2])
+    length = np.abs(distance - distance[before])
+    share = np.where(has_both, options.odometry_share, _UNKNOWN_SHARE) + _TURN_SHARE * np.abs(turn) * (length > 50.0)
+    apart = np.abs(both[0] - both[1]) / 2.0
+    sigma = np.hypot((_FIRST_SIGMA + share * length)[:, None], apart)
+    turn_sigma = np.radians(options.odometry_heading) * np.sqrt(1.0 + length / 100.0) + np.where(has_both, 0.0, 0.01)
+    motion = np.column_stack([(both[0] + both[1]) / 2.0, turn])
+    first = np.diff(chain, prepend=-1) > 0
+    motion[first] = 0.0
+    return motion, np.column_stack([sigma, turn_sigma])
+
+
+def _nearest_keyframe(frames: Keyframes, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Keyframe nearest along the drive to each fix, of the same chain."""
+    before = np.searchsorted(frames.row, rows, side="right") - 1
+    after = np.minimum(before + 1, len(frames.row) - 1)
+    at = frames.fix_distance[rows]
+    nearer = (frames.distance[after] - at < at - frames.distance[before]) & (
+        frames.chain[after] == frames.chain[before]
+    )
+    return np.where(nearer, after, before)

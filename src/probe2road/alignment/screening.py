@@ -1,0 +1,185 @@
+"""Which drives can be aligned at all: what is wrong with a drive is found before it can pull at others.
+
+Strategy: every check is a sum or a median over the rows of a drive, so that it is one pass of array code over the
+whole fleet. A check needs many rows to fail before it condemns a drive; single bad fixes are left to robust kernels.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from probe2road.fleet import Fleet
+
+__all__ = ["rows_of_points", "screen_drives"]
+
+logger = logging.getLogger(__name__)
+
+_SAME_TIME = 0.6  # s; a point belongs to the fix nearest in time, if that is no further away
+_LEAST_DRIVEN = 30.0  # m from end to end; a drive that moves less says nothing about a road
+_MOVED = 3.0  # m; over a shorter step noise decides the course
+_JUMP = 150.0  # m beyond what the speed explains
+_TOP_SPEED = 70.0  # m/s, where no speed is recorded
+_JUMPY = 0.1  # share of steps that jump, from which on two drives are mixed
+_COURSE = 40.0  # degrees between heading and course, in the median
+_CLOCK = 1.6  # factor between distance and speed times time
+_STRAY_POINTS = 0.5  # share of the points that no fix accounts for
+_FAR_POINTS = 100.0  # m from its fix; no camera sees so far
+
+
+def screen_drives(fleet: Fleet) -> NDArray[np.str_]:
+    """Say what is wrong with each drive.
+
+    Parameters
+    ----------
+    fleet
+        The fleet.
+
+    Returns
+    -------
+    ndarray of str, shape (n_traces,)
+        Why the drive cannot be aligned; empty where it can.
+
+    Examples
+    --------
+    >>> from probe2road.fleet import fleet_from_tables
+    >>> still = pd.DataFrame({"trace_id": 1, "t": range(50), "x": 446e3, "y": 4636e3})
+    >>> moving = still.assign(trace_id=2, x=446e3 + 10.0 * np.arange(50))
+    >>> screen_drives(fleet_from_tables(pd.concat([still, moving]), crs="EPSG:32616")).tolist()
+    ['does not move', '']
+    """
+    traces, starts = fleet.traces, fleet.starts
+    owner = np.repeat(np.arange(fleet.n_traces), np.diff(starts))
+    dx, dy = (np.diff(traces[axis].to_numpy(), prepend=np.nan) for axis in "xy")
+    step = np.hypot(dx, dy)
+    step[starts[:-1]] = np.nan
+    interval = _seconds(traces["t"])
+    speed = traces["speed"].to_numpy(np.float64) if "speed" in traces else np.full(len(step), np.nan)
+    jump = _jumps(step, interval, speed)
+    jumps, steps = _sum(jump, owner, fleet.n_traces), np.maximum(np.diff(starts) - 1, 1)
+
+    box = traces.groupby(owner)[["x", "y"]]
+    extent = np.hypot(*(box.max() - box.min()).to_numpy().T)
+    checks = (
+        ("does not move", extent < _LEAST_DRIVEN),
+        ("jumps to and fro: two drives with one id?", jumps > _JUMPY * steps),
+        ("the position jumps", jumps > 0),
+        ("time and speed contradict the distance", _clock_is_wrong(step, interval, speed, owner)),
+        ("heading contradicts the course", _course_is_wrong(traces, dx, dy, step, owner)),
+        ("points do not belong to the fixes", _points_are_wrong(fleet)),
+    )
+    reasons = np.select([failed for _, failed in checks], [reason for reason, _ in checks], "")
+    if (reasons != "").any():
+        names, counts = np.unique(reasons[reasons != ""], return_counts=True)
+        listed = ", ".join(f"{count} {name}" for name, count in zip(names, counts, strict=True))
+        logger.info("rejected %d of %d drives: %s", counts.sum(), fleet.n_traces, listed)
+    return reasons
+
+
+def rows_of_points(fleet: Fleet) -> NDArray[np.int64]:
+    """Return the row of the fix that each point was seen from: of its drive, nearest in time.
+
+    Returns
+    -------
+    ndarray of int64, shape (n_points,)
+        -1 where the drive has no fix within 0.6 s, or none with a clock.
+    """
+    traces, points, starts = fleet.traces, fleet.points, fleet.starts
+    if points.empty:
+        return np.zeros(0, np.int64)
+    ids = pd.Index(traces["trace_id"].iloc[starts[:-1]])
+    drive = ids.get_indexer(points["trace_id"])
+    # One ascending key for all drives: the drive, then milliseconds since the first fix of all.
+    fix_time, point_time = (_milliseconds(table["t"]) for table in (traces, points))
+    timed = ~traces["t"].isna().to_numpy()
+    found = np.full(len(points), -1, np.int64)
+    usable = np.flatnonzero((drive >= 0) & ~points["t"].isna().to_numpy())
+    if not timed.any() or len(usable) == 0:
+        return found
+    first = min(fix_time[timed].min(), point_time[usable].min())
+    span = max(fix_time[timed].max(), point_time[usable].max()) - first + 10_000
+    rows = np.flatnonzero(timed)
+    owner = np.repeat(np.arange(len(ids)), np.diff(starts))
+    key = owner[rows] * span + fix_time[rows] - first
+    wanted = drive[usable] * span + point_time[usable] - first
+    after = np.clip(np.searchsorted(key, wanted), 1, len(key) - 1) if len(key) > 1 else np.zeros(len(wanted), np.int64)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(np.abs(key[after] - wanted) < np.abs(key[before] - wanted), after, before)
+    close = np.abs(key[nearest] - wanted) <= _SAME_TIME * 1000.0
+    found[usable[close]] = rows[nearest[close]]
+    return found
+
+
+def _jumps(step: NDArray[np.float64], interval: NDArray[np.float64], speed: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which steps are longer than any driving explains."""
+    before = np.concatenate([speed[:1], speed[:-1]])
+    fastest = np.where(np.isfinite(speed + before), 2.0 * np.maximum(speed, before), _TOP_SPEED)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(step > fastest * np.where(np.isfinite(interval), interval, 10.0) + _JUMP, bool)
+
+
+def _clock_is_wrong(
+    step: NDArray[np.float64], interval: NDArray[np.float64], speed: NDArray[np.float64], owner: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Tell which drives cover another distance than their speeds and times give."""
+    before = np.concatenate([speed[:1], speed[:-1]])
+    known = np.isfinite(step + interval + speed + before) & (step > _MOVED)
+    ratio = np.full(len(step), np.nan)
+    expected = (speed + before) / 2.0 * interval
+    ratio[known] = step[known] / np.maximum(expected[known], 1e-6)
+    median = _median(ratio, owner)
+    return (median > _CLOCK) | (median < 1.0 / _CLOCK)
+
+
+def _course_is_wrong(
+    traces: pd.DataFrame,
+    dx: NDArray[np.float64],
+    dy: NDArray[np.float64],
+    step: NDArray[np.float64],
+    owner: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Tell which drives move in another direction than they head: mirrored or swapped axes."""
+    if "heading" not in traces:
+        return np.zeros(owner[-1] + 1, bool)
+    course = np.degrees(np.arctan2(dx, dy))
+    off = np.abs((traces["heading"].to_numpy(np.float64) - course + 180.0) % 360.0 - 180.0)
+    moved = np.isfinite(step) & (step >= min(_MOVED, np.nanmedian(step)))
+    return _median(np.where(moved, off, np.nan), owner) > _COURSE
+
+
+def _points_are_wrong(fleet: Fleet) -> NDArray[np.bool_]:
+    """Tell which drives have points, most of which were seen at no time and place of the drive."""
+    if fleet.points.empty:
+        return np.zeros(fleet.n_traces, bool)
+    rows = rows_of_points(fleet)
+    drive = pd.Index(fleet.traces["trace_id"].iloc[fleet.starts[:-1]]).get_indexer(fleet.points["trace_id"])
+    stray = rows < 0
+    seen = ~stray
+    away = [fleet.points[axis].to_numpy()[seen] - fleet.traces[axis].to_numpy()[rows[seen]] for axis in "xy"]
+    stray[seen] = np.hypot(*away) > _FAR_POINTS
+    known = drive >= 0
+    total = np.bincount(drive[known], minlength=fleet.n_traces)
+    strays = np.bincount(drive[known], weights=stray[known], minlength=fleet.n_traces)
+    return strays > _STRAY_POINTS * np.maximum(total, 1)
+
+
+def _seconds(times: pd.Series) -> NDArray[np.float64]:
+    """Seconds since the fix before; NaN where there is none or no clock."""
+    time = times.to_numpy(dtype="datetime64[ns]")
+    return np.asarray(np.diff(time, prepend=np.datetime64("NaT", "ns")) / np.timedelta64(1, "s"), np.float64)
+
+
+def _milliseconds(times: pd.Series) -> NDArray[np.int64]:
+    return times.to_numpy(dtype="datetime64[ms]").astype(np.int64)
+
+
+def _sum(values: NDArray[np.bool_], owner: NDArray[np.int64], n: int) -> NDArray[np.float64]:
+    return np.asarray(np.bincount(owner, weights=values, minlength=n), np.float64)
+
+
+def _median(values: NDArray[np.float64], owner: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Median of the finite values of each drive; NaN where there are none."""
+    return pd.Series(values).groupby(owner).median().to_numpy()

@@ -1,0 +1,297 @@
+"""Areas of a large fleet, aligned one by one and joined without seams.
+
+Strategy
+--------
+The plane is cut into square tiles, each aligned with a margin of its neighbours' data, in any order and in any
+process. A tile returns, for every fix in it, by how much to move it; where tiles reach into each other the moves are
+averaged with weights that fall to zero at the border of each, so a drive crosses from tile to tile without a step.
+Both sides of a seam saw nearly the same drives and the same GNSS there, which is why they agree to begin with. The
+moves of a tile are one array in the workspace, so an interrupted run goes on with the tiles that are missing.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe2road.alignment.area import AlignedArea, align_area
+from probe2road.alignment.keyframes import wrapped
+from probe2road.alignment.options import AlignOptions
+from probe2road.alignment.screening import rows_of_points
+from probe2road.fleet import Fleet
+from probe2road.workspace import Progress, Workspace
+
+__all__ = ["Moves", "Tile", "align_tiles", "find_tiles", "moved_fleet"]
+
+logger = logging.getLogger(__name__)
+
+_AHEAD = 2  # tiles cut out for the workers in advance, beside those in work
+_LEAST_WEIGHT = 1e-3  # at the border of a tile that has no neighbour there
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A square of the plane and its margin."""
+
+    name: str
+    core: tuple[float, float, float, float]  # left, bottom, right, top, m
+    margin: float  # m
+
+    @property
+    def box(self) -> tuple[float, float, float, float]:
+        """The square with its margin."""
+        left, bottom, right, top = self.core
+        return left - self.margin, bottom - self.margin, right + self.margin, top + self.margin
+
+
+@dataclass(frozen=True)
+class Moves:
+    """What alignment does to a fleet of n fixes.
+
+    Attributes
+    ----------
+    shift
+        To add to x, y (m), the direction (radians counter-clockwise) and z (m) of each fix, shape ``(n, 4)``.
+    residuals
+        One row for each point on a line: row of its keyframe, residual before, residual after (m), shape ``(m, 3)``.
+    sights
+        Number of such points by fix (at keyframes), shape ``(n,)``.
+    tiles
+        Tiles that were aligned.
+    """
+
+    shift: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    sights: NDArray[np.int64]
+    tiles: int
+
+
+def find_tiles(fleet: Fleet, options: AlignOptions, *, touched: NDArray[np.bool_] | None = None) -> list[Tile]:
+    """Return the tiles that hold fixes.
+
+    Parameters
+    ----------
+    fleet
+        The fleet.
+    options
+        Size and margin.
+    touched
+        Fixes that matter, shape ``(n,)``; all where not given. Tiles into which none of them reaches are left out.
+    """
+    xy = fleet.traces[["x", "y"]].to_numpy(np.float64)
+    xy = xy if touched is None else xy[touched]
+    # Every fix matters to the tiles whose margin it is in, too.
+    corners = [xy + np.array(offset) * options.margin for offset in ((-1, -1), (-1, 1), (1, -1), (1, 1))]
+    found = np.unique(np.floor(np.concatenate(corners) / options.tile).astype(np.int64), axis=0)
+    if touched is None:
+        found = np.unique(np.floor(xy / options.tile).astype(np.int64), axis=0)
+    return [
+        Tile(f"{column}_{row}", _square(column, row, options.tile), options.margin) for column, row in found.tolist()
+    ]
+
+
+def align_tiles(
+    fleet: Fleet,
+    usable: NDArray[np.bool_],
+    tiles: list[Tile],
+    options: AlignOptions,
+    *,
+    held: NDArray[np.bool_],
+    workspace: Workspace,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> Moves:
+    """Align every tile and join the results.
+
+    Parameters
+    ----------
+    fleet
+        The whole fleet.
+    usable
+        Drives to align or to align with, shape ``(n_traces,)``.
+    tiles
+        From `find_tiles`.
+    options
+        How.
+    held
+        Drives that must not move, shape ``(n_traces,)``.
+    workspace
+        Keeps what each tile gave.
+    workers
+        Processes; no influence on the result.
+    progress
+        Called with the number of tiles done.
+
+    Returns
+    -------
+    Moves
+    """
+    owner = np.repeat(np.arange(fleet.n_traces), np.diff(fleet.starts))
+    n = len(owner)
+    total, weight, sights = np.zeros((n, 4)), np.zeros(n), np.zeros(n, np.int64)
+    residuals = []
+    done = 0
+    for tile, moves, seen in _results(fleet, usable[owner], held, tiles, options, workspace, workers):
+        rows = moves[:, 0].astype(np.int64)
+        share = moves[:, 5]
+        total[rows] += share[:, None] * moves[:, 1:5]
+        weight[rows] += share
+        # A point counts in one tile only: the one in whose core its keyframe is.
+        left, bottom, right, top = tile.core
+        x, y = (fleet.traces[axis].to_numpy()[seen[:, 0].astype(np.int64)] for axis in "xy")
+        own = seen[(x >= left) & (x < right) & (y >= bottom) & (y < top)]
+        residuals.append(own)
+        sights += np.bincount(own[:, 0].astype(np.int64), minlength=n)
+        done += 1
+        if progress is not None:
+            progress("aligning tiles", done, len(tiles))
+    moved = weight > 0
+    total[moved] /= weight[moved, None]
+    return Moves(total, np.concatenate(residuals) if residuals else np.zeros((0, 3)), sights, done)
+
+
+def moved_fleet(fleet: Fleet, shift: NDArray[np.float64]) -> Fleet:
+    """Return a fleet with its poses moved, and its points moved rigidly with the poses that they were seen from.
+
+    Parameters
+    ----------
+    fleet
+        The fleet; not changed.
+    shift
+        As in `Moves`.
+
+    Returns
+    -------
+    Fleet
+        The same rows. Points that no fix accounts for stay where they are.
+    """
+    old = fleet.traces[["x", "y"]].to_numpy(np.float64)
+    new = old + shift[:, :2]
+    columns = {"x": new[:, 0], "y": new[:, 1], "z": fleet.traces["z"].to_numpy(np.float64) + shift[:, 3]}
+    if "heading" in fleet.traces:
+        columns["heading"] = (fleet.traces["heading"].to_numpy(np.float64) - np.degrees(shift[:, 2])) % 360.0
+    traces = fleet.traces.assign(**columns)
+    if fleet.points.empty:
+        return replace(fleet, traces=traces)
+    rows = rows_of_points(fleet)
+    seen = rows >= 0
+    at = rows[seen]
+    world = fleet.points[["x", "y", "z"]].to_numpy(np.float64)
+    away = world[seen, :2] - old[at]
+    cos, sin = np.cos(shift[at, 2]), np.sin(shift[at, 2])
+    world[seen, 0] = new[at, 0] + cos * away[:, 0] - sin * away[:, 1]
+    world[seen, 1] = new[at, 1] + sin * away[:, 0] + cos * away[:, 1]
+    world[seen, 2] += shift[at, 3]
+    points = fleet.points.assign(x=world[:, 0], y=world[:, 1], z=world[:, 2])
+    return replace(fleet, traces=traces, points=points)
+
+
+def _square(column: int, row: int, size: float) -> tuple[float, float, float, float]:
+    return column * size, row * size, (column + 1) * size, (row + 1) * size
+
+
+def _results(
+    fleet: Fleet,
+    usable: NDArray[np.bool_],
+    held: NDArray[np.bool_],
+    tiles: list[Tile],
+    options: AlignOptions,
+    workspace: Workspace,
+    workers: int,
+) -> Iterator[tuple[Tile, NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield the arrays of every tile: those that an earlier run kept, then the others as they are made."""
+    missing = []
+    for tile in tiles:
+        moves, seen = (workspace.read_array(f"{tile.name}-{part}") for part in ("moves", "residuals"))
+        if moves is None or seen is None:
+            missing.append(tile)
+        else:
+            yield tile, moves, seen
+    if len(missing) < len(tiles):
+        logger.info("taking %d of %d tiles from an earlier run", len(tiles) - len(missing), len(tiles))
+    point_rows = rows_of_points(fleet)
+    jobs = ((tile, *_cut(fleet, usable, held, point_rows, tile), options) for tile in missing)
+    made = (_align_tile(*job) for job in jobs) if workers == 1 else _in_processes(jobs, workers)
+    for tile, (moves, seen) in zip(missing, made, strict=True):
+        workspace.write_array(f"{tile.name}-residuals", seen)
+        workspace.write_array(f"{tile.name}-moves", moves)
+        yield tile, moves, seen
+
+
+def _cut(
+    fleet: Fleet, usable: NDArray[np.bool_], held: NDArray[np.bool_], point_rows: NDArray[np.int64], tile: Tile
+) -> tuple[Fleet, NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the part of a fleet inside a tile and its margin, the rows it has, and which of its drives are held."""
+    left, bottom, right, top = tile.box
+    x, y = (fleet.traces[axis].to_numpy() for axis in "xy")
+    inside = usable & (x >= left) & (x < right) & (y >= bottom) & (y < top)
+    rows = np.flatnonzero(inside)
+    seen = np.append(inside, False)[point_rows]
+    part = Fleet(fleet.traces.iloc[rows].reset_index(drop=True), fleet.points[seen].reset_index(drop=True), fleet.crs)
+    owner = np.searchsorted(fleet.starts, rows[part.starts[:-1]], side="right") - 1
+    return part, rows, held[owner]
+
+
+def _align_tile(
+    tile: Tile, part: Fleet, rows: NDArray[np.int64], held: NDArray[np.bool_], options: AlignOptions
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Align one tile: row, moves and weight of each fix (n, 6), and residuals as in `Moves`."""
+    if part.n_traces == 0:
+        return np.zeros((0, 6)), np.zeros((0, 3))
+    area = align_area(part, options, held=held)
+    shift = _fix_moves(part, area)
+    left, bottom, right, top = tile.box
+    x, y = (part.traces[axis].to_numpy() for axis in "xy")
+    inwards = np.minimum.reduce([x - left, right - x, y - bottom, top - y])
+    weight = np.clip(inwards / (2.0 * tile.margin), _LEAST_WEIGHT, 1.0)
+    seen = np.column_stack([rows[area.frames.row[area.residual_keyframe]], area.residual_before, area.residual])
+    return np.column_stack([rows, shift, weight]), seen
+
+
+def _fix_moves(part: Fleet, area: AlignedArea) -> NDArray[np.float64]:
+    """Move of every fix (n, 4), between those of the keyframes around it."""
+    frames = area.frames
+    n = len(part.traces)
+    before = np.searchsorted(frames.row, np.arange(n), side="right") - 1
+    after = np.minimum(before + 1, len(frames.row) - 1)
+    after = np.where(frames.chain[after] == frames.chain[before], after, before)
+    gap = frames.distance[after] - frames.distance[before]
+    share = np.where(gap > 0, (frames.fix_distance - frames.distance[before]) / np.maximum(gap, 1e-9), 0.0)
+    xy = part.traces[["x", "y"]].to_numpy(np.float64)
+    dz = np.nan_to_num(area.z - frames.z)
+    shift = np.zeros((n, 4))
+    for k, weight in ((before, 1.0 - share), (after, share)):
+        turn = wrapped(area.pose[k, 2] - frames.pose[k, 2])
+        away = xy - frames.pose[k, :2]
+        cos, sin = np.cos(turn), np.sin(turn)
+        shift[:, 0] += weight * (area.pose[k, 0] + cos * away[:, 0] - sin * away[:, 1] - xy[:, 0])
+        shift[:, 1] += weight * (area.pose[k, 1] + sin * away[:, 0] + cos * away[:, 1] - xy[:, 1])
+        shift[:, 2] += weight * turn
+        shift[:, 3] += weight * dz[k]
+    return shift
+
+
+def _in_processes(
+    jobs: Iterator[tuple[Tile, Fleet, NDArray[np.int64], NDArray[np.bool_], AlignOptions]], workers: int
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Align tiles in worker processes and yield the results in order, never more than a few tiles ahead."""
+    # Spawned, not forked: the parent may hold threads of numba or pyarrow.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context) as pool:
+        waiting: list[Future[tuple[NDArray[np.float64], NDArray[np.float64]]]] = []
+        try:
+            for job in jobs:
+                waiting.append(pool.submit(_align_tile, *job))
+                if len(waiting) >= workers + _AHEAD:
+                    yield waiting.pop(0).result()
+            while waiting:
+                yield waiting.pop(0).result()
+        finally:
+            for future in waiting:
+                future.cancel()
