@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor, nn
+from torch.nn import functional
 
 from probe2road.segmentation.dlinknet import ARCHITECTURES, Architecture, DLinkNet
 from probe2road.segmentation.losses import LossOptions, bce_dice, loss_function
@@ -52,9 +53,29 @@ class Variation:
     extra: Channels | None = None  # further input channels, drawn from the vectors
     loss: LossOptions = field(default_factory=partial(LossOptions, kind="bce_dice"))
     label_width: int = 3
+    fine: bool = False  # whether the decoder also gets what was seen at half and at full resolution
     keypoints: bool = False  # whether a second output learns to mark junctions
     turns: int = 1  # right angles by which squares are turned in validation, the results averaged
     weights: str = ""  # name of the run whose weights are used; trained anew where empty
+
+
+class FineDLinkNet(DLinkNet):
+    """A D-LinkNet of basic blocks whose decoder also adds what was seen at half and at full resolution."""
+
+    def __init__(self, architecture: Architecture, *, channels: int, classes: int) -> None:
+        super().__init__(architecture, channels=channels, classes=classes)
+        self.fine = nn.Conv2d(channels, architecture.head_width, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:  # (n, c, h, w), h and w multiples of 32
+        """Return logits ``(n, classes, h, w)``."""
+        stem = functional.relu(self.bn1(self.conv1(x)))
+        e1 = self.layer1(functional.max_pool2d(stem, 3, stride=2, padding=1))
+        e2 = self.layer2(e1)
+        e3 = self.layer3(e2)
+        d4 = self.decoder4(self.centre(self.layer4(e3))) + e3
+        d2 = self.decoder2(self.decoder3(d4) + e2) + e1
+        y: Tensor = self.head[1:](self.head[0](self.decoder1(d2) + stem) + self.fine(x))
+        return y
 
 
 def main() -> None:
@@ -74,13 +95,11 @@ def main() -> None:
             results[name] = run(variation, options.sets, options.steps, weights)
             options.results.write_text(json.dumps(results, indent=1))
             print(name, results[name], flush=True)
-    print(
-        "\n| run | soft F1 | GEO F1/P/R | mean of both F1 | million parameters | s a step |\n|---|---|---|---|---|---|"
-    )
+    print("\n| run | soft F1 | GEO F1/P/R | iTOPO F1 | million parameters | s a step |\n|---|---|---|---|---|---|")
     for name, row in results.items():
         print(
             f"| {VARIATIONS[name].what} | {row['soft_f1']:.3f} | {row['geo_f1']:.3f}/{row['geo_precision']:.3f}/"
-            f"{row['geo_recall']:.3f} | {row['score']:.3f} | {row['parameters'] / 1e6:.1f} | {row['seconds']:.2f} |"
+            f"{row['geo_recall']:.3f} | {row['itopo_f1']:.3f} | {row['parameters'] / 1e6:.1f} | {row['seconds']:.2f} |"
         )
 
 
@@ -90,7 +109,8 @@ def run(variation: Variation, sets: Path, steps: int, weights: Path) -> dict[str
     scenes = [(open_scene(source, sets), source.weight) for source in members(config.sources)]
     torch.manual_seed(config.seed)
     channels = len(network_channels(variation, square_vectors(scenes[0][0], (0.0, 0.0), SampleOptions(size=32))))
-    network = DLinkNet(variation.architecture, channels=channels, classes=1 + variation.keypoints)
+    kind = FineDLinkNet if variation.fine else DLinkNet
+    network = kind(variation.architecture, channels=channels, classes=1 + variation.keypoints)
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     seconds = 0.0
     if variation.weights:
@@ -275,6 +295,7 @@ VARIATIONS = {
     "altitude": Variation("and three channels of altitude layers", extra=altitude_layers),
     "keypoints": Variation("and a second output for junctions", keypoints=True),
     "turned": Variation("predictions averaged over four right angles", turns=4, weights="base"),
+    "fine_1": Variation("skip connections at full and half resolution, labels of 1 pixel", fine=True, label_width=1),
     "shallow": Variation("blocks 2, 2, 2, 2", architecture=_compact(blocks=(2, 2, 2, 2))),
     "narrow": Variation("width 16", architecture=_compact(width=16, centre_width=64)),
     "wide": Variation("width 48", architecture=_compact(width=48, centre_width=192)),

@@ -48,6 +48,7 @@ class TrainConfig:
     precision: str = "bf16"  # "bf16" (mixed) or "fp32"
     compile: bool = False  # torch.compile; pays on a GPU, not on a CPU
     start_from: str = ""  # weights file to begin with; random weights where empty
+    tile: int = 1024  # pixels, side of the tiles in which the finished network looks at an area
     keep_every: int = 500  # steps between checkpoints to resume from
 
     def __post_init__(self) -> None:

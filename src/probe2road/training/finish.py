@@ -70,6 +70,7 @@ def export_best(config: TrainConfig, state: TrainingState, output: str | Path, *
         network={"architecture": config.architecture},
         threshold=chosen["threshold"],
         seed_threshold=chosen["threshold"],
+        tile=config.tile,
         stride=STRIDE,
         training={"config": asdict(config), "step": kept["step"], "validation": kept, "thresholds": sweep},
     )

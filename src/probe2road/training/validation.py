@@ -15,6 +15,7 @@ from probe2road.clean import clean_graph
 from probe2road.errors import InputError
 from probe2road.grid import Grid
 from probe2road.metrics.geo import geo
+from probe2road.metrics.itopo import itopo
 from probe2road.metrics.normalise import clip_graph
 from probe2road.metrics.scores import Score
 from probe2road.metrics.soft_f1 import soft_f1
@@ -90,8 +91,8 @@ def validate(
     Returns
     -------
     dict
-        ``soft_f1``, ``geo_f1``, ``geo_precision``, ``geo_recall``, and ``score``, the mean of the two F1, which
-        chooses the checkpoint: a loss cannot (METHOD 2.4).
+        ``soft_f1``, ``geo_f1``, ``geo_precision``, ``geo_recall``, ``itopo_f1``, and ``score``, the mean of soft F1 and
+        GEO F1, which chooses the checkpoint: a loss cannot (METHOD 2.4).
 
     Raises
     ------
@@ -103,10 +104,13 @@ def validate(
     masks = [threshold_mask(probability, threshold=threshold) for probability in probabilities]
     soft = soft_f1(masks, [part.label for part in squares])
     graphs = [clean_graph(vectorize(skeletonize(mask), part.grid)) for mask, part in zip(masks, squares, strict=True)]
-    place = _pooled([geo(graph, part.reference) for graph, part in zip(graphs, squares, strict=True)])
+    place, ways = (
+        _pooled([metric(graph, part.reference) for graph, part in zip(graphs, squares, strict=True)])
+        for metric in (geo, itopo)
+    )
     return {
         "score": (soft.f1 + place.f1) / 2, "soft_f1": soft.f1,
-        "geo_f1": place.f1, "geo_precision": place.precision, "geo_recall": place.recall,
+        "geo_f1": place.f1, "geo_precision": place.precision, "geo_recall": place.recall, "itopo_f1": ways.f1,
     }  # fmt: skip
 
 
