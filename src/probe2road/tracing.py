@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from probe2road.errors import InputError
 
-__all__ = ["PixelGraph", "trace_pixels"]
+__all__ = ["PixelGraph", "pixel_links", "trace_pixels"]
 
 logger = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ def trace_pixels(row: NDArray[np.int64], col: NDArray[np.int64]) -> PixelGraph:
     step_row, step_col = np.diff(row), np.diff(col)
     if ((step_row < 0) | ((step_row == 0) & (step_col <= 0))).any():
         raise InputError("pixels are not sorted by row and column, or repeat", where="trace_pixels")
-    links = _links(row, col)
+    links = pixel_links(row, col)
     kept, junction = _kept_links(links)
     node, node_row, node_col = _nodes(row, col, links, kept, junction)
     start, stop, sizes, path, seen = _lines(row, col, links, kept, node, node_row, node_col)
@@ -148,7 +148,7 @@ def _with_line_ends(graph: PixelGraph) -> PixelGraph:
 
 
 @njit(cache=True)
-def _links(row: NDArray[np.int64], col: NDArray[np.int64]) -> NDArray[np.int32]:
+def pixel_links(row: NDArray[np.int64], col: NDArray[np.int64]) -> NDArray[np.int32]:
     """Find, per pixel, its eight neighbours clockwise from north, -1 where there is none; shape (n, 8).
 
     One pointer runs along the row above, so that all neighbours are found in one pass over the sorted pixels.

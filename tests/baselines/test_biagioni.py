@@ -123,10 +123,10 @@ class TestDensity:
     def test_windows_leave_no_seam(self, monkeypatch: pytest.MonkeyPatch) -> None:
         grid = Grid.from_bounds((900, 0, 1080, 90), crs=CRS)
         fleet = fleet_of(straight(910, 20, 1070, 70), straight(910, 60, 1070, 30), straight(990, 5, 991, 85))
-        lines, kernel = trip_lines(fleet, grid), blur_kernel(2.9, 8)
-        whole = level_ranks(lines, grid, kernel, closing=8)
+        kernel = blur_kernel(2.9, 8)
+        whole = level_ranks(fleet, grid, kernel, closing=8)
         monkeypatch.setattr("probe2road.baselines.biagioni.density._WINDOW", 37)
-        np.testing.assert_array_equal(level_ranks(lines, grid, kernel, closing=8), whole)
+        np.testing.assert_array_equal(level_ranks(fleet, grid, kernel, closing=8), whole)
         assert whole.max() > 4
 
 

@@ -5,7 +5,8 @@ Strategy
 How many branches leave a pixel is read off the ring two pixels away from it, its fringe: the pixels of that ring
 which a set pixel of the inner ring connects to the centre, in groups around the circle. A pixel in the middle of a
 line has two groups; all others are node pixels, or are isolated. Lines are then burnt away: a fire is lit beside a
-node, runs along line pixels depth first, and where it meets another node the way it took is a line.
+node, runs along line pixels depth first, and where it meets another node the way it took is a line. All of this goes
+from pixel to neighbouring pixel, so memory follows the length of the skeleton and not the area.
 """
 
 from __future__ import annotations
@@ -18,14 +19,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.skeleton import skeleton_pixels
-from probe2road.tracing import PixelGraph
+from probe2road.tracing import PixelGraph, pixel_links
 
 __all__ = ["fringe_branches", "trace_fringe"]
 
 logger = logging.getLogger(__name__)
 
-_EMPTY, _LINE, _UNNUMBERED = 0, -1, -2  # kinds of pixels; those of a node have its number plus one
-_STEP_ROW, _STEP_COL = (-1, 0, 1, 0, -1, -1, 1, 1), (0, 1, 0, -1, -1, 1, 1, -1)  # neighbours, those beside first
+_STEP_ROW, _STEP_COL = (-1, -1, 0, 1, 1, 1, 0, -1), (0, 1, 1, 1, 0, -1, -1, -1)  # neighbours, clockwise from north
+_BESIDE_FIRST = (0, 2, 4, 6, 1, 3, 5, 7)  # neighbours that share a side, then those at the corners
+# Place in the ring, clockwise from north-west, of what lies up to two rows and columns away.
+_RING = np.array([[0, 1, 2, 3, 4], [15, -1, -1, -1, 5], [14, -1, -1, -1, 6], [13, -1, -1, -1, 7], [12, 11, 10, 9, 8]])
 
 
 def fringe_branches(skeleton: NDArray[Any]) -> NDArray[np.int64]:
@@ -48,10 +51,7 @@ def fringe_branches(skeleton: NDArray[Any]) -> NDArray[np.int64]:
     >>> fringe_branches(np.array([[1, 1, 1, 1, 1, 1]])).tolist()
     [1, 1, 2, 2, 1, 1]
     """
-    row, col = skeleton_pixels(skeleton)
-    padded = np.zeros((skeleton.shape[0] + 4, skeleton.shape[1] + 4), bool)
-    padded[row + 2, col + 2] = True
-    return _branches(padded, row + 2, col + 2)
+    return _branches(pixel_links(*skeleton_pixels(skeleton)))
 
 
 def trace_fringe(skeleton: NDArray[Any], *, min_length: float = 0.0) -> PixelGraph:
@@ -85,15 +85,26 @@ def trace_fringe(skeleton: NDArray[Any], *, min_length: float = 0.0) -> PixelGra
     ([0.0, 7.0], [0], [1], [0.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0])
     """
     row, col = skeleton_pixels(skeleton)
-    branches = fringe_branches(skeleton)
-    kind = np.zeros((skeleton.shape[0] + 2, skeleton.shape[1] + 2), np.int32)
-    kind[row[branches == 2] + 1, col[branches == 2] + 1] = _LINE
-    at_node = (branches == 1) | (branches > 2)
-    node_row, node_col = _number_nodes(kind, row[at_node] + 1, col[at_node] + 1)
-    start, stop, sizes, path_row, path_col = _burn(kind, row[at_node] + 1, col[at_node] + 1, node_row, node_col)
-    graph = _long_enough(node_row, node_col, start, stop, sizes, path_row, path_col, min_length)
-    logger.info("traced %d pixels into %d nodes and %d lines", len(row), len(graph.node_row), len(graph.start))
+    links = pixel_links(row, col)
+    branches = _branches(links)
+    node = _node_of_pixel(links, (branches == 1) | (branches > 2))
+    node_row, node_col = _rounded_means(node, row), _rounded_means(node, col)
+    start, stop, sizes, path = _burn(links, branches == 2, node)
+    # Every line begins and ends with the position of its node.
+    last = np.cumsum(sizes)
+    places, ends = np.stack([last - sizes, last], axis=1).reshape(-1), np.stack([start, stop], axis=1).reshape(-1)
+    line_row = np.insert(row[path].astype(np.float64), places, node_row[ends])
+    line_col = np.insert(col[path].astype(np.float64), places, node_col[ends])
+    graph = _long_enough(node_row, node_col, start, stop, sizes + 2, line_row, line_col, min_length)
+    logger.info("traced %d pixels into %d nodes and %d lines", len(node), len(graph.node_row), len(graph.start))
     return graph
+
+
+def _rounded_means(node: NDArray[np.int64], values: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the mean over the pixels of every node, rounded down."""
+    known = node >= 0
+    total = np.bincount(node[known], values[known])
+    return np.asarray(np.floor(total / np.bincount(node[known])))
 
 
 def _long_enough(
@@ -106,7 +117,7 @@ def _long_enough(
     col: NDArray[np.float64],
     min_length: float,
 ) -> PixelGraph:
-    """Drop short lines and then nodes without lines, and take off the frame of one pixel."""
+    """Drop short lines, and then nodes without lines."""
     line = np.repeat(np.arange(len(sizes)), sizes)
     step = np.hypot(np.diff(row, prepend=0), np.diff(col, prepend=0))
     step[np.cumsum(sizes) - sizes] = 0.0
@@ -114,131 +125,110 @@ def _long_enough(
     start, stop, sizes, vertex = start[kept], stop[kept], sizes[kept], kept[line]
     used = np.unique(np.concatenate([start, stop]))
     return PixelGraph(
-        node_row=node_row[used] - 1,
-        node_col=node_col[used] - 1,
+        node_row=node_row[used],
+        node_col=node_col[used],
         start=np.searchsorted(used, start),
         stop=np.searchsorted(used, stop),
-        row=row[vertex] - 1,
-        col=col[vertex] - 1,
+        row=row[vertex],
+        col=col[vertex],
         offsets=np.concatenate([[0], np.cumsum(sizes)]),
     )
 
 
 @njit(cache=True)
-def _branches(padded: NDArray[np.bool_], row: NDArray[np.int64], col: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Count the groups of fringe pixels around pixels of a skeleton that is padded by two."""
-    ring_row = np.array([-2, -2, -2, -2, -2, -1, 0, 1, 2, 2, 2, 2, 2, 1, 0, -1])  # clockwise from north-west
-    ring_col = np.array([-2, -1, 0, 1, 2, 2, 2, 2, 2, 1, 0, -1, -2, -2, -2, -2])
-    branches = np.zeros(len(row), np.int64)
+def _branches(links: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Count the groups of fringe pixels around every pixel: what is two steps away and in the ring."""
+    branches = np.zeros(len(links), np.int64)
     fringe = np.zeros(16, np.bool_)
-    for pixel in range(len(row)):
-        for k in range(16):
-            fringe[k] = False
-            if not padded[row[pixel] + ring_row[k], col[pixel] + ring_col[k]]:
+    for pixel in range(len(links)):
+        fringe[:] = False
+        for first in range(8):
+            inner = links[pixel, first]
+            if inner < 0:
                 continue
-            # Inner pixels that touch this one: one at a corner, else two or three.
-            for r in range(max(ring_row[k] - 1, -1), min(ring_row[k] + 1, 1) + 1):
-                for c in range(max(ring_col[k] - 1, -1), min(ring_col[k] + 1, 1) + 1):
-                    fringe[k] |= (r != 0 or c != 0) and padded[row[pixel] + r, col[pixel] + c]
-        for k in range(16):
-            branches[pixel] += fringe[k] and not fringe[k - 1]
+            for second in range(8):
+                down, right = _STEP_ROW[first] + _STEP_ROW[second], _STEP_COL[first] + _STEP_COL[second]
+                place = _RING[down + 2, right + 2]
+                if place >= 0 and links[inner, second] >= 0:
+                    fringe[place] = True
+        for place in range(16):
+            branches[pixel] += fringe[place] and not fringe[place - 1]
     return branches
 
 
 @njit(cache=True)
-def _number_nodes(
-    kind: NDArray[np.int32], row: NDArray[np.int64], col: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Write the number of its node plus one into every node pixel; return the nodes' means, rounded down."""
-    for pixel in range(len(row)):
-        kind[row[pixel], col[pixel]] = _UNNUMBERED
-    node_row, node_col = [0.0 for _ in range(0)], [0.0 for _ in range(0)]
-    for pixel in range(len(row)):
-        if kind[row[pixel], col[pixel]] != _UNNUMBERED:
+def _node_of_pixel(links: NDArray[np.int32], at_node: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the node of every pixel, -1 for none: node pixels that touch share one, in the order of their first."""
+    node = np.full(len(links), -1, np.int64)
+    count = 0
+    for first in range(len(links)):
+        if not at_node[first] or node[first] >= 0:
             continue
-        number = len(node_row) + 1
-        kind[row[pixel], col[pixel]] = number
-        members = [(row[pixel], col[pixel])]
-        place = 0
-        while place < len(members):
-            r, c = members[place]
-            place += 1
-            for dr in range(-1, 2):
-                for dc in range(-1, 2):
-                    if kind[r + dr, c + dc] == _UNNUMBERED:
-                        kind[r + dr, c + dc] = number
-                        members.append((r + dr, c + dc))
-        total_row = total_col = 0
-        for r, c in members:
-            total_row, total_col = total_row + r, total_col + c
-        node_row.append(float(total_row // len(members)))
-        node_col.append(float(total_col // len(members)))
-    return np.array(node_row, np.float64), np.array(node_col, np.float64)
+        node[first] = count
+        stack = [first]
+        while len(stack) > 0:
+            pixel = stack.pop()
+            for other in links[pixel]:
+                if other >= 0 and at_node[other] and node[other] < 0:
+                    node[other] = count
+                    stack.append(int(other))
+        count += 1
+    return node
 
 
 @njit(cache=True)
 def _burn(
-    kind: NDArray[np.int32],
-    row: NDArray[np.int64],
-    col: NDArray[np.int64],
-    node_row: NDArray[np.float64],
-    node_col: NDArray[np.float64],
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Burn all lines beside node pixels: start and stop nodes, numbers of vertices, and the vertices."""
+    links: NDArray[np.int32], line: NDArray[np.bool_], node: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Burn all lines beside nodes: start and stop nodes, numbers of pixels, and the pixels from start to stop."""
+    unburnt, parent = line.copy(), np.full(len(links), -1, np.int64)
     start, stop, sizes = [0 for _ in range(0)], [0 for _ in range(0)], [0 for _ in range(0)]
-    path_row, path_col = [0.0 for _ in range(0)], [0.0 for _ in range(0)]
-    for pixel in range(len(row)):
-        here = int(kind[row[pixel], col[pixel]]) - 1
-        for k in range(8):
-            r, c = row[pixel] + _STEP_ROW[k], col[pixel] + _STEP_COL[k]
-            if kind[r, c] != _LINE:
+    path = [0 for _ in range(0)]
+    for pixel in range(len(links)):
+        if node[pixel] < 0:
+            continue
+        for k in _BESIDE_FIRST:
+            first = int(links[pixel, k])
+            if first < 0 or not unburnt[first]:
                 continue
-            there, way_row, way_col = _fire(kind, r, c, here)
-            if there < 0:
+            last, there = _fire(links, unburnt, parent, node, first, node[pixel])
+            if last < 0:
                 continue
-            start.append(here)
+            before = len(path)
+            while last >= 0:
+                path.append(last)
+                last = parent[last]
+            path[before:] = path[before:][::-1]
+            start.append(node[pixel])
             stop.append(there)
-            sizes.append(len(way_row) + 2)
-            path_row.append(node_row[here])
-            path_col.append(node_col[here])
-            for place in range(len(way_row) - 1, -1, -1):
-                path_row.append(float(way_row[place]))
-                path_col.append(float(way_col[place]))
-            path_row.append(node_row[there])
-            path_col.append(node_col[there])
-    return (
-        np.array(start, np.int64), np.array(stop, np.int64), np.array(sizes, np.int64),
-        np.array(path_row, np.float64), np.array(path_col, np.float64),
-    )  # fmt: skip
+            sizes.append(len(path) - before)
+    return np.array(start, np.int64), np.array(stop, np.int64), np.array(sizes, np.int64), np.array(path, np.int64)
 
 
 @njit(cache=True)
-def _fire(kind: NDArray[np.int32], row: int, col: int, origin: int) -> tuple[int, list[int], list[int]]:
-    """Burn line pixels depth first until another node is beside the fire; that node and the way back from it.
+def _fire(
+    links: NDArray[np.int32],
+    unburnt: NDArray[np.bool_],
+    parent: NDArray[np.int64],
+    node: NDArray[np.int64],
+    first: int,
+    origin: int,
+) -> tuple[int, int]:
+    """Burn from a line pixel, depth first, until another node is beside the fire.
 
-    The node is -1 where the fire goes out before.
+    Returns the pixel there and the node, both -1 where the fire goes out before; parents lead back to the first pixel.
     """
-    rows, cols, parent = [row], [col], [-1]
-    stack = [0]
-    kind[row, col] = _EMPTY
-    way_row, way_col = [0 for _ in range(0)], [0 for _ in range(0)]
+    unburnt[first], parent[first] = False, -1
+    stack = [first]
     while len(stack) > 0:
-        place = stack.pop()
-        r, c = rows[place], cols[place]
-        for k in range(8):
-            there = int(kind[r + _STEP_ROW[k], c + _STEP_COL[k]]) - 1
-            if there >= 0 and there != origin:
-                while place >= 0:
-                    way_row.append(rows[place])
-                    way_col.append(cols[place])
-                    place = parent[place]
-                return there, way_row, way_col
-        for k in range(7, -1, -1):  # so that pixels beside come off the stack before those at the corners
-            r_next, c_next = r + _STEP_ROW[k], c + _STEP_COL[k]
-            if kind[r_next, c_next] == _LINE:
-                kind[r_next, c_next] = _EMPTY
-                rows.append(r_next)
-                cols.append(c_next)
-                parent.append(place)
-                stack.append(len(rows) - 1)
-    return -1, way_row, way_col
+        pixel = stack.pop()
+        for k in _BESIDE_FIRST:
+            other = int(links[pixel, k])
+            if other >= 0 and node[other] >= 0 and node[other] != origin:
+                return pixel, node[other]
+        for k in _BESIDE_FIRST[::-1]:  # so that pixels beside come off the stack before those at the corners
+            other = int(links[pixel, k])
+            if other >= 0 and unburnt[other]:
+                unburnt[other], parent[other] = False, pixel
+                stack.append(other)
+    return -1, -1

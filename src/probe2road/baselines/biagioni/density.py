@@ -2,11 +2,10 @@
 
 Strategy
 --------
-Every trip is drawn with anti-aliased lines into a scratch image of its own, which its last pixel hands over to the
-sum and clears: a trip counts once per pixel, however often it passes. Scratch image and sum cover the whole grid,
-but only pages near a trace are ever touched. Blur and closing then run window by window with a halo, and windows
-without a line are skipped. What is kept of the density is the rank of the highest level that it reaches, one byte
-per pixel, because thinning asks for nothing else.
+Windows are drawn, blurred and closed one at a time, with a halo, and those without a trip are skipped. In a window,
+every trip is drawn with anti-aliased lines into a scratch image of its own, which its last segment hands over to the
+sum and clears: a trip counts once per pixel, however often it passes. What is kept of the density is the rank of the
+highest level that it reaches, one byte per pixel, because thinning asks for nothing else.
 """
 
 from __future__ import annotations
@@ -35,12 +34,13 @@ _WINDOW = 1024  # pixels; side of the windows that are blurred one at a time
 def trip_lines(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> NDArray[np.int32]:
     """Sum the trips' lines: each is anti-aliased, one pixel wide, of value 32, and counts once per pixel.
 
-    Lines run between the centres of the fixes' pixels, as those of OpenCV do unless told otherwise.
+    Lines run between the centres of the fixes' pixels, as those of OpenCV do unless told otherwise. What lies outside
+    the grid is left out.
 
     Parameters
     ----------
     fleet
-        The fleet, in the grid's CRS and inside it.
+        The fleet, in the grid's CRS.
     grid
         Where to draw.
     gaps
@@ -64,10 +64,7 @@ def trip_lines(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> ND
            [ 0, 64, 64, 64, 64,  0],
            [ 0,  0,  0,  0,  0,  0]], dtype=int32)
     """
-    row, col = grid.rowcol(fleet.traces["x"], fleet.traces["y"])
-    total = np.zeros(grid.shape, np.int32)
-    _draw_trips(row, col, trace_breaks(fleet, gaps), fleet.starts, np.zeros(grid.shape, np.uint8), total)
-    return total
+    return _drawn(_segments(fleet, grid, gaps), Window(0, 0, *grid.shape))
 
 
 def blur_kernel(sigma: float, half_width: int) -> NDArray[np.float64]:
@@ -104,16 +101,14 @@ def close_with_disk(values: NDArray[Any], radius: int) -> NDArray[Any]:
 
 
 def level_ranks(
-    lines: NDArray[np.int32], grid: Grid, kernel: NDArray[np.float64], *, closing: int
+    fleet: Fleet, grid: Grid, kernel: NDArray[np.float64], *, closing: int, gaps: TraceGaps | None = None
 ) -> NDArray[np.uint8]:
-    """Blur, round, close with a disk, and rank by the levels: how many of `LEVELS` the density of a pixel reaches.
+    """Draw all trips, blur, round, close with a disk, and rank by the levels.
 
     Parameters
     ----------
-    lines
-        From `trip_lines`.
-    grid
-        Its grid.
+    fleet, grid, gaps
+        As for `trip_lines`.
     kernel
         From `blur_kernel`.
     closing
@@ -122,20 +117,43 @@ def level_ranks(
     Returns
     -------
     ndarray of uint8, shape (rows, cols)
-        0 to 28.
+        How many of `LEVELS` the density of a pixel reaches, 0 to 28.
     """
     ranks = np.zeros(grid.shape, np.uint8)
-    halo = len(kernel) // 2 + 2 * closing
+    segments = _segments(fleet, grid, gaps)
     driven = 0
-    for window in grid.windows(_WINDOW, halo=halo):
-        part = _cut(lines, window)
-        if not part.any():
+    for window in grid.windows(_WINDOW, halo=len(kernel) // 2 + 2 * closing):
+        lines = _drawn(segments, window)
+        if not lines.any():
             continue
-        density = close_with_disk(np.rint(blur(part, kernel)).astype(np.int32), closing)
+        density = close_with_disk(np.rint(blur(lines, kernel)).astype(np.int32), closing)
         ranks[window.core] = np.searchsorted(LEVELS, density[window.inner], side="right")
         driven += 1
     logger.info("density of %d windows, highest level %d", driven, LEVELS[ranks.max() - 1] if ranks.any() else 0)
     return ranks
+
+
+def _segments(fleet: Fleet, grid: Grid, gaps: TraceGaps | None) -> NDArray[np.int64]:
+    """List trip, row and column of the start, and row and column of the end of all segments; shape ``(5, S)``."""
+    row, col = grid.rowcol(fleet.traces["x"], fleet.traces["y"])
+    trip = np.repeat(np.arange(fleet.n_traces), np.diff(fleet.starts))
+    end = np.flatnonzero(~trace_breaks(fleet, gaps))
+    return np.stack([trip[end], row[end - 1], col[end - 1], row[end], col[end]])
+
+
+def _drawn(segments: NDArray[np.int64], window: Window) -> NDArray[np.int32]:
+    """Sum the lines of all trips in a window and its halo."""
+    shape = window.rows + 2 * window.halo, window.cols + 2 * window.halo
+    trip, r0, c0, r1, c1 = segments
+    top, left = window.row - window.halo, window.col - window.halo
+    touching = (np.maximum(r0, r1) >= top - 1) & (np.minimum(r0, r1) <= top + shape[0])
+    touching &= (np.maximum(c0, c1) >= left - 1) & (np.minimum(c0, c1) <= left + shape[1])
+    near = np.flatnonzero(touching)
+    total = np.zeros(shape, np.int32)
+    if len(near):
+        ends = r0[near] - top, c0[near] - left, r1[near] - top, c1[near] - left
+        _draw_trips(trip[near], *ends, np.zeros(shape, np.uint8), total)
+    return total
 
 
 def _dilated(values: NDArray[Any], radius: int) -> NDArray[Any]:
@@ -151,35 +169,28 @@ def _dilated(values: NDArray[Any], radius: int) -> NDArray[Any]:
     return result
 
 
-def _cut(values: NDArray[Any], window: Window) -> NDArray[Any]:
-    """Return a window and its halo, zero outside the grid."""
-    top, left = window.row - window.halo, window.col - window.halo
-    bottom, right = window.row + window.rows + window.halo, window.col + window.cols + window.halo
-    rows, cols = values.shape
-    inside = values[max(top, 0) : bottom, max(left, 0) : right]
-    return np.pad(inside, ((max(-top, 0), max(bottom - rows, 0)), (max(-left, 0), max(right - cols, 0))))
-
-
 @njit(cache=True)
 def _draw_trips(
-    row: NDArray[np.int64],
-    col: NDArray[np.int64],
-    breaks: NDArray[np.bool_],
-    starts: NDArray[np.int64],
+    trip: NDArray[np.int64],
+    r0: NDArray[np.int64],
+    c0: NDArray[np.int64],
+    r1: NDArray[np.int64],
+    c1: NDArray[np.int64],
     scratch: NDArray[np.uint8],
     total: NDArray[np.int32],
 ) -> None:
     """Draw trip after trip into the scratch image (all zero before and after) and add each to the total."""
     cols = scratch.shape[1]
-    for trip in range(len(starts) - 1):
-        touched = [0 for _ in range(0)]
-        for fix in range(starts[trip] + 1, starts[trip + 1]):
-            if not breaks[fix]:
-                _draw_segment(row[fix - 1], col[fix - 1], row[fix], col[fix], scratch, touched)
+    touched = [0 for _ in range(0)]
+    for segment in range(len(trip)):
+        _draw_segment(r0[segment], c0[segment], r1[segment], c1[segment], scratch, touched)
+        if segment + 1 < len(trip) and trip[segment + 1] == trip[segment]:
+            continue
         for pixel in touched:
             r, c = pixel // cols, pixel % cols
             total[r, c] += scratch[r, c]
             scratch[r, c] = 0
+        touched.clear()
 
 
 @njit(cache=True)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe2road.baselines.biagioni.collapse import collapse_segments
-from probe2road.baselines.biagioni.density import blur_kernel, level_ranks, trip_lines
+from probe2road.baselines.biagioni.density import blur_kernel, level_ranks
 from probe2road.baselines.biagioni.gray_skeleton import gray_skeleton
 from probe2road.baselines.biagioni.pruning import prune_segments
 from probe2road.baselines.biagioni.street_map import initial_map, straight_pieces
@@ -142,9 +142,8 @@ def _skeleton(
         return kept
     report("density", 0, 1)
     sigma, cut = (length / options.resolution for length in SIGMAS[options.sigma])
-    lines = trip_lines(fleet, grid, gaps=options.gaps)
     closing = round(options.closing / options.resolution)
-    ranks = level_ranks(lines, grid, blur_kernel(sigma, round(cut)), closing=closing)
+    ranks = level_ranks(fleet, grid, blur_kernel(sigma, round(cut)), closing=closing, gaps=options.gaps)
     report("skeleton", 0, 1)
     skeleton = gray_skeleton(ranks)
     work.write_raster("1-skeleton", skeleton, grid)
