@@ -65,7 +65,7 @@ def align(
     workspace
         Folder that keeps the result of each tile, from which an interrupted run goes on.
     workers
-        Processes; no influence on the result.
+        Processes; no influence on the result beyond the tolerance of the solver, millimetres.
     progress
         Called as the work goes on.
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 
 from probe2road.alignment.keyframes import keyframes, sightings
 from probe2road.alignment.options import AlignOptions
@@ -14,7 +15,8 @@ def test_motion_is_that_between_keyframes(road: Any) -> None:
     frames = keyframes(road.fleet([road.drive(k, np.random.default_rng(k), turn=0.7) for k in range(2)]), OPTIONS)
     moving = ~frames.first
     assert frames.first.sum() == 2
-    assert np.allclose(frames.motion[moving][:-1, 0], 20.0, atol=6.0)
+    assert np.median(frames.motion[moving, 0]) == pytest.approx(20.0)
+    assert (frames.motion[moving, 0] > 0).all()
     assert np.allclose(frames.motion[:, 1:], 0.0, atol=1e-6)
 
 

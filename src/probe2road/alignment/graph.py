@@ -23,7 +23,7 @@ from probe2road.errors import MissingExtraError
 __all__ = ["optimise"]
 
 _GNSS_KERNEL = 2.0  # sigmas of one fix beyond which GNSS counts less (Cauchy)
-_SIGHT_KERNEL = 3.0  # sigmas of a condensed factor beyond which it counts less (Cauchy)
+_SIGHT_KERNEL = 10.0  # sigmas of a condensed factor beyond which it counts less (Cauchy)
 _HEADING_SIGMA = 3.0  # degrees, of the recorded heading; weak, it only keeps patches from turning
 _PATCH_SIGMA = (20.0, 20.0, 0.1)  # m, m, radians; where a patch would be without anything said about it
 _ITERATIONS = 15

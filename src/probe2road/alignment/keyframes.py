@@ -6,7 +6,7 @@ Distance and direction are worked out for every fix at once. A keyframe is the f
 metres; a chain is the keyframes of one drive without a gap. There is no odometry in the data, so the motion between
 two keyframes is taken twice: from the positions, which follow the filter of the vehicle, and by dead reckoning from
 heading and speed. The mean is used, and where the two disagree, as in a multipath burst or a queue, the motion is
-trusted by no more than their difference. Points are fixed to the nearest keyframe of their chain.
+trusted by no more than half their difference. Points are fixed to the nearest keyframe of their chain.
 """
 
 from __future__ import annotations
@@ -55,9 +55,12 @@ class Keyframes:
 
     def inflation(self, options: AlignOptions) -> NDArray[np.float64]:
         """Factor on the sigma of whatever has errors that neighbours share, so that all together count once: (k,)."""
-        # A keyframe stands for the road to the next one; sparse fixes share less.
+        # A keyframe stands for the road to the next one. Sparse fixes share less, and a short chain counts as one, too.
         step = np.diff(self.distance, append=self.distance[-1:])
-        return np.sqrt(options.gnss_length / np.clip(step, options.keyframe_spacing / 2.0, options.gnss_length))
+        starts = self.starts
+        length = np.add.reduceat(np.where(np.append(self.first[1:], True), 0.0, step), starts[:-1])
+        shared = np.clip(length, options.keyframe_spacing, options.gnss_length)[np.cumsum(self.first) - 1]
+        return np.sqrt(shared / np.clip(step, np.minimum(options.keyframe_spacing / 2.0, shared), shared))
 
     @property
     def first(self) -> NDArray[np.bool_]:

@@ -23,7 +23,7 @@ __all__ = ["Condensed", "Matches", "condense", "match_lines"]
 
 _BIN = 0.1  # m, of the profile in which peaks are found
 _HALF_WIDTH = 25.0  # m, to either side of a spine
-_PEAK_APART = 0.6  # m; of two peaks nearer than this the higher one is a line
+_PEAK_APART = 1.2  # m; of two peaks nearer than this the higher one is a line, the other may be drives that are off
 _LEAST_POINTS = 5.0  # that make a line
 _STEEPEST = 0.1  # m of slope per metre along
 _INDEPENDENT = 8.0  # points of a keyframe that count; more share their errors

@@ -36,6 +36,7 @@ _OUTLIERS = 0.05  # least rate of anything anywhere, as a share of the average
 _VIEW_SMOOTHING = 1.5  # m, 1 sigma: of the fleet's view to the side, so that single lines do not show in it
 _SPREAD_ALONG = 2  # places to which a vote spreads, either way
 _OWN_WINDOW = 8  # keyframes before and after that say what a drive sees all along
+_OWN_SHARE = 0.95  # of that rate; a little less than all, so that a drive prefers where others were
 _OWN_DOUBT = 0.3  # keyframes whose average view they are mixed with
 _SPREAD_DECAY = 0.75  # of a vote, from place to place
 
@@ -396,7 +397,7 @@ def _own_rates(
         i = k - begin
         _add_sights(k, 1.0, 0.0, offsets, origin, value, kind, nowhere, nowhere, search, seen[i : i + 1])
         _add_view(k, 1.0, own[k], offsets, 0, kind, view, nowhere, nowhere, search, could[i : i + 1])
-    rates = np.ones((end - begin, kinds, n_bins), np.float32)
+    rates = np.zeros((end - begin, kinds, n_bins), np.float32)
     for which in range(kinds):
         doubt = _OWN_DOUBT * view[which].max()
         for b in range(n_bins):
@@ -413,7 +414,7 @@ def _own_rates(
                     total_could -= could[i - _OWN_WINDOW - 1, which, b]
                 others_seen = max(total_seen - seen[i, which, b], 0.0)
                 others_could = max(total_could - could[i, which, b], 0.0)
-                rates[i, which, b] = (others_seen + doubt) / (others_could + doubt)
+                rates[i, which, b] = _OWN_SHARE * (others_seen + doubt) / (others_could + doubt)
     return rates
 
 

@@ -21,6 +21,7 @@ logger = logging.getLogger(__name__)
 _SAME_TIME = 0.6  # s; a point belongs to the fix nearest in time, if that is no further away
 _LEAST_DRIVEN = 30.0  # m from end to end; a drive that moves less says nothing about a road
 _MOVED = 3.0  # m; over a shorter step noise decides the course
+_ROLLED = 1.0  # m; a shorter step may be a wait
 _JUMP = 150.0  # m beyond what the speed explains
 _TOP_SPEED = 70.0  # m/s, where no speed is recorded
 _JUMPY = 0.1  # share of steps that jump, from which on two drives are mixed
@@ -126,10 +127,11 @@ def _clock_is_wrong(
 ) -> NDArray[np.bool_]:
     """Tell which drives cover another distance than their speeds and times give."""
     before = np.concatenate([speed[:1], speed[:-1]])
-    known = np.isfinite(step + interval + speed + before) & (step > _MOVED)
-    ratio = np.full(len(step), np.nan)
     expected = (speed + before) / 2.0 * interval
-    ratio[known] = step[known] / np.maximum(expected[known], 1e-6)
+    with np.errstate(invalid="ignore"):
+        moving = (step > _ROLLED) & (expected > _ROLLED)
+    ratio = np.full(len(step), np.nan)
+    ratio[moving] = step[moving] / expected[moving]
     median = _median(ratio, owner)
     return (median > _CLOCK) | (median < 1.0 / _CLOCK)
 

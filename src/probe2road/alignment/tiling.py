@@ -124,7 +124,7 @@ def align_tiles(
     workspace
         Keeps what each tile gave.
     workers
-        Processes; no influence on the result.
+        Processes; no influence on the result beyond the tolerance of the solver, millimetres.
     progress
         Called with the number of tiles done.
 

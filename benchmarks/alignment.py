@@ -1,0 +1,134 @@
+"""What alignment does to simulated raw fleets, measured against their true poses.
+
+    python benchmarks/alignment.py /tmp/benchmark/columbus --area 327000 4424000 329000 4425500 --every 4
+    python benchmarks/alignment.py --simulate open_sky --area 327000 4424000 329000 4425500 --km 120
+
+The first form reads a prepared data set, the second one drives the Columbus network in that area anew. Prints, before
+and after: the error of trajectories (root mean square, m), the median lateral error, the same where 15 drives or more
+pass, the median error along, the robust standard deviation between the drives at a place (25 m of one road) of the
+lateral, the longitudinal and the vertical error, and the share of drives of which more than half is nearer to the
+neighbouring lane than to its own, as the others see it. `--picture` draws the busiest place.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import shapely
+
+from probe2road.align import align
+from probe2road.alignment.report import draw_alignment
+from probe2road.benchmark.datasets import find_dataset, load_network
+from probe2road.fleet import Fleet
+from probe2road.io.fleet_reader import read_fleet
+from probe2road.simulate.fleet_simulation import simulate
+
+HALF_LANE = 1.75  # m
+PLACE = 25.0  # m
+FEW, MANY = 5, 15  # drives at a place
+
+
+def recorded(folder: Path, area: tuple[float, float, float, float], every: int) -> tuple[Fleet, pd.DataFrame]:
+    """Every n-th drive of a data set within an area, and its true poses, row by row."""
+    fleet = read_fleet(folder / "drives.parquet", folder / "drives.points.parquet", bbox=area)
+    keep = [table["trace_id"] % every == 0 for table in (fleet.traces, fleet.points)]
+    traces, points = fleet.traces[keep[0]].reset_index(drop=True), fleet.points[keep[1]].reset_index(drop=True)
+    ids = traces["trace_id"].unique().tolist()
+    table = pq.read_table(folder / "poses.parquet", filters=[("trace_id", "in", ids)])
+    place = table.column("geometry").combine_chunks()
+    axes = {axis: place.field(axis).to_numpy(zero_copy_only=False) for axis in "xyz"}
+    truth = table.drop_columns(["geometry"]).to_pandas().assign(**axes)
+    return Fleet(traces, points, fleet.crs), traces[["trace_id", "t"]].merge(truth, on=["trace_id", "t"], how="left")
+
+
+def simulated(
+    preset: str, area: tuple[float, float, float, float], km: float, data: Path
+) -> tuple[Fleet, pd.DataFrame]:
+    """Drives of a preset on the part of the Columbus network that lies in an area, and their true poses."""
+    definition = find_dataset(f"columbus-{preset}")
+    network = load_network(definition, data)
+    inside = network.sections.geometry.intersects(shapely.box(*area))
+    sections = network.sections[inside]
+    turns = network.restrictions
+    kept = turns["from_section"].isin(sections.index) & turns["to_section"].isin(sections.index)
+    nodes = network.nodes.loc[sorted({*sections["u"], *sections["v"]})]
+    part = replace(network, sections=sections, nodes=nodes, restrictions=turns[kept])
+    made = simulate(part, preset=definition.fleet, drive_km=km, seed=5)
+    return made.fleet, made.poses
+
+
+def errors(fleet: Fleet, truth: pd.DataFrame) -> pd.DataFrame:
+    """Errors of every fix in the frame of the true pose, and its place."""
+    theta = np.pi / 2.0 - np.radians(truth["heading"].to_numpy())
+    east, north, up = (fleet.traces[axis].to_numpy() - truth[axis].to_numpy() for axis in "xyz")
+    return pd.DataFrame(
+        {
+            "drive": fleet.traces["trace_id"],
+            "left": np.cos(theta) * north - np.sin(theta) * east,
+            "ahead": np.cos(theta) * east + np.sin(theta) * north,
+            "up": up,
+            "section": truth["section"],
+            "quarter": np.round(theta / (np.pi / 2.0)),
+            "column": truth["x"] // PLACE,
+            "row": truth["y"] // PLACE,
+        }
+    )
+
+
+def figures(table: pd.DataFrame) -> dict[str, float]:
+    """One line of the printed table."""
+    places = table.groupby(["section", "quarter", "column", "row"])
+    drives = places["drive"].transform("nunique")
+    shared = drives >= FEW
+    between = {name: (table[name] - places[name].transform("median"))[shared] for name in ("left", "ahead", "up")}
+    off = (between["left"].abs() > HALF_LANE).groupby(table["drive"][shared]).mean() > 0.5
+    busy = table["left"][drives >= MANY].abs()
+    return {
+        "ATE": float(np.sqrt((table["left"] ** 2 + table["ahead"] ** 2).mean())),
+        "lateral": float(table["left"].abs().median()),
+        f"lateral, {MANY}+": float(busy.median()),
+        "along": float(table["ahead"].abs().median()),
+        **{f"spread {name}": 1.4826 * float(values.abs().median()) for name, values in between.items()},
+        "lane off": float(off.mean()),
+    }
+
+
+def main() -> None:
+    """Align one fleet and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("--simulate", dest="preset")
+    parser.add_argument("--area", type=float, nargs=4, required=True)
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--km", type=float, default=120.0)
+    parser.add_argument("--data", type=Path, default=Path("../shared/data/osm"))
+    parser.add_argument("--picture", type=Path)
+    given = parser.parse_args()
+    logging.basicConfig(format="%(message)s")
+    area = tuple(given.area)
+    if given.preset:
+        fleet, truth = simulated(given.preset, area, given.km, given.data)
+    else:
+        fleet, truth = recorded(given.folder, area, given.every)
+    cpu = time.process_time()
+    result = align(fleet)
+    cpu = time.process_time() - cpu
+    table = pd.DataFrame(
+        {name: figures(errors(part, truth)) for name, part in (("before", fleet), ("after", result.fleet))}
+    )
+    print(f"{fleet.n_traces} drives, {len(fleet.traces)} poses, {len(fleet.points)} points; {cpu:.1f} CPU-s")
+    print(table.T.round(3).to_string())
+    print(result.report.summary)
+    if given.picture:
+        draw_alignment(fleet, result.fleet, given.picture)
+
+
+if __name__ == "__main__":
+    main()
