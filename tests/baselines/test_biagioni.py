@@ -10,7 +10,7 @@ from probe2road.baselines.biagioni.collapse import collapse_segments, run_errors
 from probe2road.baselines.biagioni.density import LEVELS, blur, blur_kernel, close_with_disk, level_ranks, trip_lines
 from probe2road.baselines.biagioni.gray_skeleton import gray_skeleton
 from probe2road.baselines.biagioni.pruning import prune_segments
-from probe2road.baselines.biagioni.recipe import SIGMAS, BiagioniOptions, build_biagioni
+from probe2road.baselines.biagioni.recipe import FLEET, SIGMAS, BiagioniOptions, build_biagioni
 from probe2road.baselines.biagioni.street_map import straight_pieces
 from probe2road.baselines.biagioni.traversals import Runs, good_runs, match_pieces, observe_trips
 from probe2road.errors import OptionError
@@ -235,6 +235,13 @@ class TestRecipe:
         assert graph.length == pytest.approx(800, abs=60)
         again = build_biagioni(fleet, BiagioniOptions(last_runs=True), workspace=tmp_path / "work")
         assert again.length == pytest.approx(graph.length)
+
+    def test_carriageways_stay_apart_with_the_settings_for_fleet_data_only(self) -> None:
+        drives = [straight(900, y + d, 1300, y + d, 41) for y in (500.0, 512.0) for d in (-0.5, 0.0, 0.5)]
+        fleet = fleet_of(*drives)
+        assert build_biagioni(fleet, FLEET).length == pytest.approx(800, abs=60)
+        published = build_biagioni(fleet, BiagioniOptions(last_runs=True))
+        assert published.length == pytest.approx(400, abs=40)
 
     def test_one_trip_is_no_road(self) -> None:
         graph = build_biagioni(fleet_of(straight(900, 500, 1300, 500, 41)))
