@@ -24,7 +24,7 @@ from probe2road.alignment.spines import OnSpines, Spines
 __all__ = ["VERTICAL", "Floors", "find_floors", "floor_of", "registered_heights"]
 
 VERTICAL = 1.6  # vertical over horizontal error of GNSS under open sky
-_PERSUASION = 3.0  # weight of all heights that a drive shares with others, in observations
+_PERSUASION = 5.0  # weight of all heights that a drive shares with others, in observations
 _LOOK_AHEAD = 4  # cells ahead of a keyframe in which it sees things, and one behind
 _FAR = 10_000.0  # m, more than any height
 
@@ -69,7 +69,8 @@ def registered_heights(
         np.zeros(len(raw)),
         np.maximum(options.height_share * length, 0.1),
         VERTICAL * frames.sigma * frames.inflation(options),
-        ShiftSearch(options.height_search, 0.5, 3.0 * options.height_search, 0.7, 0.7, persuasion), held=held,
+        ShiftSearch(options.height_search, 0.5, 3.0 * options.height_search, 0.7, 0.7, persuasion, novelty=0.0),
+        held=held,
     )  # fmt: skip
     return raw + shift
 

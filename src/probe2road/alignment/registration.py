@@ -36,7 +36,6 @@ _OUTLIERS = 0.05  # least rate of anything anywhere, as a share of the average
 _VIEW_SMOOTHING = 1.5  # m, 1 sigma: of the fleet's view to the side, so that single lines do not show in it
 _SPREAD_ALONG = 2  # places to which a vote spreads, either way
 _OWN_WINDOW = 8  # keyframes before and after that say what a drive sees all along
-_OWN_SHARE = 0.95  # of that rate; a little less than all, so that a drive prefers where others were
 _OWN_DOUBT = 0.3  # keyframes whose average view they are mixed with
 _SPREAD_DECAY = 0.75  # of a vote, from place to place
 
@@ -64,6 +63,7 @@ class ShiftSearch(NamedTuple):
     kernel: float  # m, 1 sigma, by which a vote is spread
     doubt: float  # keyframes that must have looked at a place before what they saw counts half
     temper: float  # weight of one observation; below 1, because neighbouring ones share errors
+    novelty: float = 0.95  # weight of what the drive itself saw, against the average, where nobody could see yet
 
 
 @dataclass(frozen=True)
@@ -414,7 +414,8 @@ def _own_rates(
                     total_could -= could[i - _OWN_WINDOW - 1, which, b]
                 others_seen = max(total_seen - seen[i, which, b], 0.0)
                 others_could = max(total_could - could[i, which, b], 0.0)
-                rates[i, which, b] = _OWN_SHARE * (others_seen + doubt) / (others_could + doubt)
+                own_rate = (others_seen + doubt) / (others_could + doubt)
+                rates[i, which, b] = search.novelty * own_rate + 1.0 - search.novelty
     return rates
 
 
