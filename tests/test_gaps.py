@@ -10,6 +10,7 @@ import pytest
 import shapely
 
 from probe2road.errors import OptionError
+from probe2road.gap_stems import facing_stems
 from probe2road.gaps import GapOptions, drop_undriven, fill_gaps, gap_weights, prune_gaps
 from probe2road.roadgraph import RoadGraph, check_graph, empty_graph, graph_from_lines
 from probe2road.splitting import split_edges
@@ -227,3 +228,48 @@ def test_what_nobody_drives_is_dropped_with_its_turns():
     assert drop_undriven(graph, steps, min_traces=0) is graph
     with pytest.raises(OptionError, match="min_traces is -1"):
         drop_undriven(graph, steps, min_traces=-1)
+
+
+BARS = [[(0, 0), (50, 0)], [(50, 0), (99, 0)], [(0, 20), (50, 20)], [(50, 20), (99, 20)]]
+SOUTH, NORTH = [(50, -60), (50, 0)], [(50, 20), (50, 80)]
+
+
+def stems(*lines: Sequence[tuple[float, ...]], **options: Any) -> list[list[list[float]]]:
+    """Return the places of the junctions that are joined because roads that end in them face each other."""
+    graph = graph_of(*lines)
+    places = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
+    return [sorted(places[pair].tolist()) for pair in facing_stems(graph, GapOptions(**options))]
+
+
+def test_junctions_whose_stems_face_each_other_are_joined():
+    assert stems(*BARS, SOUTH, NORTH) == [[[50.0, 0.0], [50.0, 20.0]]]
+    filled = fill_gaps(graph_of(*BARS, SOUTH, NORTH))
+    check_graph(filled)
+    joined = filled.edges[filled.edges["origin"] == "gap"].geometry
+    assert any(line.equals(shapely.LineString([(50, 0), (50, 20)])) for line in joined)
+
+
+def test_a_stem_may_face_a_dead_end():
+    assert stems(*BARS[:2], SOUTH, NORTH) == [[[50.0, 0.0], [50.0, 20.0]]]
+
+
+@pytest.mark.parametrize(
+    ("second", "options"),
+    [
+        ([(80, 20), (80, 80)], {}),  # not ahead
+        ([(50, 20), (99, 60)], {}),  # turns away
+        (NORTH, {"stem_turn": 0.0}),
+        (NORTH, {"max_length": 19.0}),
+    ],
+)
+def test_junctions_that_do_not_face_each_other_are_left_apart(second, options):
+    bars = [*BARS[:2], [(0, 20), second[0]], [second[0], (99, 20)]]
+    assert stems(*bars, SOUTH, second, **options) == []
+
+
+def test_junctions_with_an_edge_between_them_need_no_link():
+    assert stems(*BARS, SOUTH, [(50, 0), (60, 8), (60, 12), (50, 20)], NORTH, heading_length=5.0) == []
+
+
+def test_a_link_between_junctions_crosses_no_third_road():
+    assert stems(*BARS, [(0, 10), (99, 10)], SOUTH, NORTH) == []

@@ -24,6 +24,7 @@ __all__ = [
     "DeadEnds",
     "GapOptions",
     "Links",
+    "angle_between",
     "crosses",
     "dead_ends",
     "straight_on",
@@ -51,6 +52,7 @@ class GapOptions:
     min_angle: float = 20.0  # degrees; of two links at one node that differ by less, the shorter is made
     heading_length: float = 15.0  # m, over which the direction of a dead end is measured
     max_links: int = 2  # links at one node
+    stem_turn: float = 20.0  # degrees, at both ends of a link between junctions that face each other; 0: no such links
 
     def __post_init__(self) -> None:
         """Refuse negative numbers."""
@@ -116,7 +118,7 @@ def to_dead_ends(ends: DeadEnds, options: GapOptions) -> Links:
     pairs = KDTree(ends.position).query_pairs(options.max_length, output_type="ndarray") if len(ends.edge) else []
     one, other = np.concatenate([pairs, np.flip(pairs, 1)]).T if len(pairs) else np.zeros((2, 0), np.int64)
     vector = ends.position[other] - ends.position[one]
-    turns = np.stack([_angle(ends.ahead[one], vector), _angle(-ends.ahead[other], vector)])
+    turns = np.stack([angle_between(ends.ahead[one], vector), angle_between(-ends.ahead[other], vector)])
     distance = np.hypot(*vector.T) * (1.0 + turns.sum(axis=0) / _TURN)
     fits = (turns.max(axis=0) <= options.max_turn) & (distance > 0)
     one, other, distance = one[fits], other[fits], distance[fits]
@@ -162,12 +164,12 @@ def to_edges_beside(
     ahead = shapely.points(ends.position[end] + _LEAD * aside[:, None] * ends.ahead[end])
     along = shapely.line_locate_point(lines[edge], ahead)
     target = shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], along))
-    slope = _angle(ends.ahead[end], _directions(lines[edge], along))
+    slope = angle_between(ends.ahead[end], _directions(lines[edge], along))
     kept = (
         (aside > _TOUCH)
-        & (_angle(ends.ahead[end], to_edge) >= _ALONG)  # else it is ahead, not beside
+        & (angle_between(ends.ahead[end], to_edge) >= _ALONG)  # else it is ahead, not beside
         & (np.minimum(slope, 180.0 - slope) <= _ALONG)
-        & (_angle(ends.ahead[end], target - ends.position[end]) <= _ALONG)
+        & (angle_between(ends.ahead[end], target - ends.position[end]) <= _ALONG)
         & _apart_on_edge(lines, ends, end, edge, along, options.max_length)
     )
     order = np.flatnonzero(kept)
@@ -213,12 +215,12 @@ def within_reach(ends: DeadEnds, links: Links, options: GapOptions) -> Links:
     """Drop links that are too long, turn too sharply, or lead nowhere."""
     vector = links.target - ends.position[links.end]
     length = np.hypot(*vector.T)
-    turn = _angle(ends.ahead[links.end], vector)
+    turn = angle_between(ends.ahead[links.end], vector)
     # A link into a dead end turns there too, by whatever rule it came about.
     of_node = pd.Series(np.arange(len(ends.node)), index=ends.node).groupby(level=0).first()
     other = of_node.reindex(links.node).to_numpy(np.float64)
     into = np.isfinite(other)
-    turn[into] = np.maximum(turn[into], _angle(-ends.ahead[other[into].astype(np.int64)], vector[into]))
+    turn[into] = np.maximum(turn[into], angle_between(-ends.ahead[other[into].astype(np.int64)], vector[into]))
     elsewhere = (links.node != ends.node[links.end]) & (length > 0)
     return links.where(elsewhere & (length <= options.max_length) & (turn <= options.max_turn))
 
@@ -247,7 +249,7 @@ def _directions(lines: NDArray[np.object_], along: NDArray[np.float64]) -> NDArr
     return np.asarray(shapely.get_coordinates(after) - shapely.get_coordinates(before))
 
 
-def _angle(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+def angle_between(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angle between vectors of shape (n, 2), degrees from 0 to 180."""
     cross = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
     return np.asarray(np.degrees(np.arctan2(np.abs(cross), (one * other).sum(axis=1))))

@@ -31,6 +31,7 @@ from probe2road.gap_links import (
     to_edges_beside,
     within_reach,
 )
+from probe2road.gap_stems import facing_stems
 from probe2road.roadgraph import RoadGraph, finish_edges
 from probe2road.splitting import split_edges
 
@@ -52,6 +53,9 @@ def fill_gaps(graph: RoadGraph, *, options: GapOptions | None = None) -> RoadGra
        split there;
     3. the nearest edge within ``beside`` that runs along it, as a mainline beside the end of its ramp, joined a
        little ahead. The paper does not have this rule; ``beside=0`` switches it off.
+
+    4. Junctions are joined where roads that end in them face each other (`probe2road.gap_stems`), as where the piece
+       between two carriageways is lost. The paper does not have this rule; ``stem_turn=0`` switches it off.
 
     No link is longer than ``max_length`` or crosses an edge, links at one node differ by ``min_angle`` or more, and no
     node gets more than ``max_links``. The result does not depend on the order of the edges. A graph without gaps to
@@ -100,7 +104,10 @@ def fill_gaps(graph: RoadGraph, *, options: GapOptions | None = None) -> RoadGra
     links = links.where(~crosses(graph, tree, ends, links))
     links = _chosen(ends, links, options)
     logger.info("added %d gap edges from %d dead ends", len(links.end), len(ends.edge))
-    return _with_links(graph, ends, links) if len(links.end) else graph
+    filled = _with_links(graph, ends, links) if len(links.end) else graph
+    stems = facing_stems(filled, options)
+    logger.info("added %d gap edges between junctions", len(stems))
+    return _with_edges(filled, *filled.nodes.index.to_numpy()[stems.T]) if len(stems) else filled
 
 
 def gap_weights(graph: RoadGraph, *, gap: float = 0.1) -> pd.Series:
@@ -240,6 +247,11 @@ def _with_links(graph: RoadGraph, ends: DeadEnds, links: Links) -> RoadGraph:
     u = names[ends.node[links.end]]
     v = names[links.node]
     v[into] = made
+    return _with_edges(graph, u, v)
+
+
+def _with_edges(graph: RoadGraph, u: NDArray[np.int64], v: NDArray[np.int64]) -> RoadGraph:
+    """Add straight edges of origin ``gap`` between nodes."""
     lines = _straight_lines(graph, u, v)
     first = int(graph.edges.index.max()) + 1
     new = gpd.GeoDataFrame(
