@@ -35,7 +35,7 @@ from probe2road.simulate.osm import read_network
 
 CASES = ("cloverleaf", "diamond", "trumpet", "regular town", "irregular town", "tokyo_shibuya")
 PRESETS = ("mixed", "phone")
-UNMOVED = BuildOptions(refinement=RefineOptions(move=False))
+UNMOVED = BuildOptions(segmenter="density", refinement=RefineOptions(move=False))
 
 _STEP = 5.0  # m between the places at which the error is measured
 _FAR = 15.0  # m; what is farther from every true road running that way is a wrong road, not a wrong place

@@ -39,7 +39,7 @@ ROAD, EDGE, GAP, NODE, DEAD_END = "#d9dde3", "#27496d", "#d1495b", "#111111", "#
 def stages(simulated: SimulatedFleet) -> list[RoadGraph]:
     """Build a graph and return it after each step."""
     fleet = simulated.fleet
-    graph = build(fleet, BuildOptions(refine=False))
+    graph = build(fleet, BuildOptions(segmenter="density", refine=False))
     filled = fill_gaps(graph)
     pruned = clean_graph(prune_gaps(filled, match(fleet, filled, edge_weights=gap_weights(filled)).steps))
     matches = match(fleet, pruned)

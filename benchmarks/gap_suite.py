@@ -69,7 +69,7 @@ def measure(kind: str, preset: str, drives: int) -> list[dict[str, object]]:
     network = generate_interchange(kind, rng=np.random.default_rng(1))
     simulated = simulate(network, preset=replace(find_preset(preset), camera=None), n_drives=drives, seed=1)
     reference, distances = simulated.reference, road_distances(simulated.reference)
-    graph = build(simulated.fleet, BuildOptions(refine=False))
+    graph = build(simulated.fleet, BuildOptions(segmenter="density", refine=False))
     border = shapely.union_all(reference.nodes.geometry[reference.degrees() == 1].to_numpy())
     ends = graph.nodes[graph.degrees() == 1]
     inner = ends.index[ends.geometry.distance(border).fillna(np.inf) > _BORDER]

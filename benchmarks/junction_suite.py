@@ -250,7 +250,7 @@ def score_builds(name: str, preset: str, counts: Iterable[int], *, seed: int) ->
     for k in counts:
         chosen = fleet.traces["trace_id"].map(repetition) < k
         some = replace(fleet, traces=fleet.traces[chosen].reset_index(drop=True))
-        built = build(some, BuildOptions(refine=False))
+        built = build(some, BuildOptions(segmenter="density", refine=False))
         filled = fill_gaps(built)
         joined = clean_graph(prune_gaps(filled, match(some, filled, edge_weights=gap_weights(filled)).steps))
         matches = match(some, joined)

@@ -1,6 +1,6 @@
 """Build road graphs from the real public traces with the defaults and score them as the literature does.
 
-Usage: python benchmarks/real_traces.py [--data ../shared/data] [--pictures docs/img]
+Usage: python benchmarks/real_traces.py [--data ../shared/data] [--segmenter density] [--pictures docs/img]
 
 Prints Markdown tables: our row beside the published ones (Tang et al. 2019, IJGI 8:411, and the programs they
 compare), then the metrics of this project. Each build runs in a process of its own, from the raw file to the
@@ -70,18 +70,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     default = os.environ.get("PROBE2ROAD_DATA", str(Path(__file__).parents[2] / "shared" / "data"))
     parser.add_argument("--data", type=Path, default=Path(default))
+    parser.add_argument("--segmenter", default="network", choices=("network", "density"))
+    parser.add_argument("--weights", type=Path, help="of the network; the shipped ones without it")
     parser.add_argument("--pictures", type=Path, help="folder for a picture of each city")
     arguments = parser.parse_args()
     for city in CITIES:
         folder = arguments.data / "traces" / city
         if not folder.is_dir():
             sys.exit(f"{folder}: there is no such folder; pass --data")
-        report(city, folder, arguments.pictures)
+        report(city, folder, arguments)
 
 
-def report(city: str, folder: Path, pictures: Path | None) -> None:
+def report(city: str, folder: Path, arguments: argparse.Namespace) -> None:
     """Build one city and print its tables."""
-    graph, seconds, megabytes = timed_build(city, folder)
+    ours_is, pictures = f"probe2road, {arguments.segmenter}", arguments.pictures
+    graph, seconds, megabytes = timed_build(city, folder, arguments)
     lines = read_graph(folder / "gt_traversed_tang.geojson")
     traversed = read_graph(folder / "gt_traversed_graph.geojson")
     print(f"\n## {city}\n\n{graph.length / 1000:.1f} km, {len(graph.edges)} edges; {seconds:.1f} s and ", end="")
@@ -89,13 +92,13 @@ def report(city: str, folder: Path, pictures: Path | None) -> None:
 
     ours = evaluate(graph, lines, metrics=["buffer_geo"])
     print("| map | km | 5 m | 10 m | 15 m | 20 m |\n|---|---|---|---|---|---|")
-    print(f"| **probe2road, density** | {graph.length / 1000:.1f} | {' | '.join(triples(ours))} |")
+    print(f"| **{ours_is}** | {graph.length / 1000:.1f} | {' | '.join(triples(ours))} |")
     for name, (km, *scores) in BUFFER_GEO[city].items():
         print(f"| {name} | {'' if km is None else km} | {' | '.join(f'{score:.3f}' for score in scores)} |")
 
     ours = evaluate(graph, traversed, metrics=["graph_sampling"])
     print("\n| graph sampling | 5 m | 10 m | 15 m |\n|---|---|---|---|")
-    print(f"| **probe2road, density** | {' | '.join(triples(ours))} |")
+    print(f"| **{ours_is}** | {' | '.join(triples(ours))} |")
     for name, published in GRAPH_SAMPLING[city].items():
         print(f"| {name} | {' | '.join(f'{score:.3f}' for score in published)} |")
 
@@ -142,12 +145,14 @@ def triples(scores: pd.DataFrame) -> list[str]:
     return [f"{row.f1:.3f}/{row.precision:.3f}/{row.recall:.3f}" for row in scores.itertuples()]
 
 
-def timed_build(city: str, folder: Path) -> tuple[RoadGraph, float, float]:
+def timed_build(city: str, folder: Path, arguments: argparse.Namespace) -> tuple[RoadGraph, float, float]:
     """Run the command line on the raw file: the graph, seconds, and peak megabytes."""
     crs, columns = CITIES[city]
     with tempfile.TemporaryDirectory() as temporary:
         output = Path(temporary) / "roads.gpkg"
         words = ["-q", "build", folder / "traces.csv.gz", "--columns", columns, "--crs", crs, "--output", output]
+        words += ["--segmenter", arguments.segmenter]
+        words += ["--weights", arguments.weights] if arguments.weights is not None else []
         started = time.perf_counter()
         subprocess.run([Path(sys.executable).with_name("probe2road"), *map(str, words)], check=True)
         seconds = time.perf_counter() - started

@@ -81,7 +81,7 @@ def rows(fleet: Fleet) -> list[Row]:
         done.append(Row(step, graph, time.perf_counter() - started))
         started = time.perf_counter()
 
-    built = build(fleet, BuildOptions(refine=False))
+    built = build(fleet, BuildOptions(segmenter="density", refine=False))
     note("no post-processing", built)
     filled = fill_gaps(built)
     matches = match(fleet, filled, edge_weights=gap_weights(filled))

@@ -81,7 +81,9 @@ def report(name: str, options: argparse.Namespace) -> None:
         tiles = read_tiles(recording.folder)
         areas = {f"{name}, {split}": split_area(tiles, split) for split in SPLITS}
     print(f"\n### {name}, {options.data}\n")
-    print("| area | segmenter | soft F1/P/R, as it is | thinned | GEO F1/P/R | iTOPO F1/P/R | TOPO F1 | APLS | km | s |")
+    print(
+        "| area | segmenter | soft F1/P/R, as it is | thinned | GEO F1/P/R | iTOPO F1/P/R | TOPO F1 | APLS | km | s |"
+    )
     print(f"|{'---|' * 10}")
     for segmenter in options.segmenters.split(","):
         with tempfile.TemporaryDirectory() as scratch:
@@ -112,6 +114,7 @@ def line(made: Built, reference: RoadGraph, area: shapely.Geometry | None) -> st
     """Score mask and graph within an area."""
     cells = []
     for proposal, width in ((made.mask, 3), (made.skeleton, 1)):
+        label = label_mask(reference, made.grid, width=width)
         proposals, references = [], []
         for window in made.grid.windows(1024):
             grid = window.grid(made.grid)
@@ -119,7 +122,7 @@ def line(made: Built, reference: RoadGraph, area: shapely.Geometry | None) -> st
                 continue
             inside = within(grid, area)
             proposals.append((proposal[window.core] != 0) & inside)
-            references.append((label_mask(reference, grid, width=width) != 0) & inside)
+            references.append((label[window.core] != 0) & inside)
         score = soft_f1(proposals, references)
         cells.append(f"{score.f1:.3f}/{score.precision:.3f}/{score.recall:.3f}")
     plain = replace(made.graph, turns=made.graph.turns.iloc[:0])

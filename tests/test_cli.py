@@ -118,7 +118,7 @@ def test_options_come_from_toml(folder, call):
         (["build", "drives.csv", *COLUMNS, "-o", "absent/x.gpkg"], "does not exist; create it first"),
         (["build", "drives.csv", *COLUMNS, "--bbox", "1,2,3", "-o", "x.gpkg"], "left,bottom,right,top"),
         (["build", "drives.csv", "--columns", "trip", "-o", "x.gpkg"], "ours=theirs"),
-        (["build", "drives.csv", *COLUMNS, "--segmenter", "magic", "-o", "x.gpkg"], "use network or density"),
+        (["build", "drives.csv", *COLUMNS, "--segmenter", "magic", "-o", "x.gpkg"], "use auto, network, density"),
         (
             ["build", "drives.csv", *COLUMNS, "--weights", "absent.onnx", "-o", "x.gpkg"],
             "absent.onnx: weights cannot be",

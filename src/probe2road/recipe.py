@@ -32,7 +32,7 @@ __all__ = ["SEGMENTERS", "BuildOptions", "Progress", "build", "draw_stages"]
 
 logger = logging.getLogger(__name__)
 
-SEGMENTERS = ("network", "density")
+SEGMENTERS = ("auto", "network", "density")
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class BuildOptions:
     """Everything that decides which graph comes out."""
 
     resolution: float = 1.0  # m per pixel
-    segmenter: str = "density"  # one of SEGMENTERS
+    segmenter: str = "auto"  # one of SEGMENTERS; auto: a network where there are semantic points, else density
     gaps: TraceGaps = field(default_factory=TraceGaps)  # where traces are broken
     network: NetworkOptions = field(default_factory=NetworkOptions)  # of the learned segmenter
     density: DensityOptions = field(default_factory=DensityOptions)  # of the density segmenter
@@ -52,7 +52,7 @@ class BuildOptions:
     def __post_init__(self) -> None:
         """Refuse an unknown segmenter."""
         if self.segmenter not in SEGMENTERS:
-            raise OptionError(f"there is no segmenter {self.segmenter!r}", fix=f"use {' or '.join(SEGMENTERS)}")
+            raise OptionError(f"there is no segmenter {self.segmenter!r}", fix=f"use {', '.join(SEGMENTERS)}")
 
 
 def build(
@@ -107,7 +107,8 @@ def build(
     """
     options, report = options or BuildOptions(), progress or _silent
     grid = fleet_grid(fleet, resolution=options.resolution)
-    weights = find_weights(fleet, options.network) if options.segmenter == "network" else None
+    learned = options.segmenter == "network" or (options.segmenter == "auto" and len(fleet.points) > 0)
+    weights = find_weights(fleet, options.network) if learned else None
     work = open_workspace(workspace, fleet, options, weights=weights.digest if weights else None)
     if (graph := work.read_graph("7-roads")) is not None:
         return graph

@@ -19,7 +19,7 @@ from probe2road.recipe import BuildOptions, build
 from probe2road.segmentation.density import DensityOptions
 
 CRS = "EPSG:32616"
-OPTIONS = BuildOptions(density=DensityOptions(bandwidth=5.0))
+OPTIONS = BuildOptions(segmenter="density", density=DensityOptions(bandwidth=5.0))
 UNREFINED = replace(OPTIONS, refine=False)
 FEW = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from probe2road.errors import InputError, needs_extra
 from probe2road.segmentation.dlinknet import STRIDE
-from probe2road.segmentation.export_onnx import export
+from probe2road.segmentation.export_onnx import export, load_parameters
 from probe2road.segmentation.weights import ModelInfo
 from probe2road.training.config import TrainConfig
 from probe2road.training.loop import predict_squares
@@ -56,24 +56,25 @@ def export_best(config: TrainConfig, state: TrainingState, output: str | Path, *
         raise InputError("there are no weights yet", where=path, fix="train at least to the first validation")
     network = build_network(config)
     network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
-    squares = validation_squares(config.validation, config.sample, sets)
-    probabilities = predict_squares(network, config, squares)
-    sweep = [{"threshold": at, **validate(squares, probabilities, threshold=at)} for at in THRESHOLDS]
-    chosen = max(sweep, key=lambda row: row["score"])
-    logger.info(
-        "threshold %.1f: soft F1 %.3f, GEO F1 %.3f", *(chosen[name] for name in ("threshold", "soft_f1", "geo_f1"))
-    )
     kept = max(state.curve, key=lambda row: row["score"])
     info = ModelInfo(
         name=config.name,
         channels=config.channels,
         network={"architecture": config.architecture},
-        threshold=chosen["threshold"],
-        seed_threshold=chosen["threshold"],
         tile=config.tile,
         stride=STRIDE,
-        training={"config": asdict(config), "step": kept["step"], "validation": kept, "thresholds": sweep},
+        training={"config": asdict(config), "step": kept["step"], "curve": state.curve},
     )
     file = Path(output) / f"{config.name}.onnx"
+    export(network, info, file)
+    load_parameters(network, file)  # rounded, as users will run them
+    squares = validation_squares(config.validation, config.sample, sets)
+    probabilities = predict_squares(network, replace(config, precision="fp32"), squares)
+    sweep = [{"threshold": at, **validate(squares, probabilities, threshold=at)} for at in THRESHOLDS]
+    chosen = max(sweep, key=lambda row: row["score"])
+    scores = [chosen[name] for name in ("threshold", "soft_f1", "geo_f1")]
+    logger.info("threshold %.1f: soft F1 %.3f, GEO F1 %.3f", *scores)
+    at = chosen["threshold"]
+    info = replace(info, threshold=at, seed_threshold=at, training={**info.training, "thresholds": sweep})
     export(network, info, file)
     return file
