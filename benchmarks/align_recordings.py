@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from probe2road.align import align
-from probe2road.crs import transform
+from probe2road.crs import WGS84, transform
 from probe2road.fleet import Fleet, fleet_from_tables
 
 GPS_EPOCH = pd.Timestamp("1980-01-06", tz="UTC")
@@ -39,7 +39,7 @@ def nagoya(folder: Path) -> tuple[Fleet, np.ndarray, np.ndarray]:
         | {"accuracy": np.hypot(rover[7], rover[8]) / np.sqrt(2.0)}
     )
     fleet = fleet_from_tables(table, crs="EPSG:4326")
-    x, y = transform(reference["Longitude"].to_numpy(), reference["Latitude"].to_numpy(), "EPSG:4326", fleet.crs)
+    x, y = transform(reference["Longitude"].to_numpy(), reference["Latitude"].to_numpy(), WGS84, fleet.crs)
     return fleet, week + at, np.column_stack([x, y])
 
 
@@ -55,7 +55,7 @@ def i280(folder: Path) -> tuple[Fleet, np.ndarray, np.ndarray]:
     )
     fleet = fleet_from_tables(table, crs="EPSG:4326")
     longitude, latitude = reference["longitude_deg"].to_numpy(), reference["latitude_deg"].to_numpy()
-    x, y = transform(longitude, latitude, "EPSG:4326", fleet.crs)
+    x, y = transform(longitude, latitude, WGS84, fleet.crs)
     return fleet, reference["boot_time_s"].to_numpy(), np.column_stack([x, y])
 
 
