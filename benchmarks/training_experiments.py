@@ -3,9 +3,9 @@
 Usage: probe2road benchmark prepare columbus rhein_neckar porto milan interchanges corridors --output SETS
        python benchmarks/training_experiments.py SETS RESULTS.json [--steps 800] [--names base,width_1,...]
 
-Prints the Markdown table of docs/results/training.md. Results are kept in RESULTS.json run by run; a run that is
+Prints a Markdown table of docs/results/segmentation.md. Results are kept in RESULTS.json run by run; a run that is
 there already is not repeated. Every run has the same seed, samples, steps and learning rates. What is not in the
-shipped configuration was not worth it (docs/decisions/0011-what-the-network-sees.md) and lives here only.
+shipped configuration lives here only, until it proves worth it.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import rasterio
 
 from probe2road.errors import CRSError, InputError, OptionError
-from probe2road.grid import Grid, read_raster, write_raster
+from probe2road.grid import Grid, read_raster, sparse_zeros, write_raster
 
 CRS = "EPSG:32616"
 
@@ -69,3 +71,17 @@ def test_a_raster_that_is_none_is_named(tmp_path):
     (tmp_path / "noise.tif").write_bytes(b"not a raster")
     with pytest.raises(InputError, match=r"noise\.tif"):
         read_raster(tmp_path / "noise.tif")
+
+
+def test_sparse_zeros_take_memory_where_they_are_written():
+    resident = Path("/proc/self/statm")
+    if not resident.exists():
+        pytest.skip("this system does not tell how much memory a process has")
+    before = int(resident.read_text().split()[1])
+    area = sparse_zeros((20_000, 20_000), np.float32)
+    for row in range(0, 20_000, 2_000):
+        area[row : row + 100, 7_000:7_100] = 1
+    pages = int(resident.read_text().split()[1]) - before
+    assert area.sum() == 10 * 100 * 100
+    assert pages * 4096 < 50e6  # of 1.6 GB
+    assert sparse_zeros((0, 5), np.uint8).shape == (0, 5)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 from pyproj import CRS
 
 from probe2road.crs import parse_crs, require_metric
 from probe2road.errors import InputError, OptionError
 from probe2road.io.atomic import atomic_path
 
-__all__ = ["Grid", "Window", "read_raster", "write_raster"]
+__all__ = ["Grid", "Window", "read_raster", "sparse_zeros", "write_raster"]
 
 
 @dataclass(frozen=True)
@@ -170,6 +171,27 @@ def write_raster(
             target.write(band.astype(profile["dtype"], copy=False), number)
         for number, name in enumerate(names, start=1):
             target.set_band_description(number, name)
+
+
+def sparse_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """Return zeros that take memory only where they are written to.
+
+    An ordinary large array of zeros comes in pages of 2 MB, because numpy asks the system for large ones. A few windows
+    written along a road then fill all of it. Here pages have their ordinary size of some kilobytes, on systems that map
+    private memory; elsewhere it is an ordinary array.
+
+    Examples
+    --------
+    >>> city = sparse_zeros((30_000, 30_000), np.float32)  # 3.4 GiB, if it were filled
+    >>> city[5, 5:9] = 1
+    >>> city[5, 3:7]
+    array([0., 0., 1., 1.], dtype=float32)
+    """
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    if size == 0 or not hasattr(mmap, "MAP_PRIVATE"):
+        return np.zeros(shape, dtype)
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    return np.frombuffer(memory, dtype).reshape(shape)
 
 
 def read_raster(path: str | Path) -> tuple[NDArray[Any], Grid]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from probe2road.errors import CRSError, InputError
 from probe2road.fleet import Fleet, TraceGaps, trace_breaks
-from probe2road.grid import Grid, Window
+from probe2road.grid import Grid, Window, sparse_zeros
 
 __all__ = [
     "CHANNELS",
@@ -91,7 +91,7 @@ def rasterize(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> NDA
            [0, 0, 0, 1, 0],
            [1, 1, 1, 0, 0]], dtype=uint32)
     """
-    counts = np.zeros((len(CHANNELS), *grid.shape), np.uint32)
+    counts = sparse_zeros((len(CHANNELS), *grid.shape), np.uint32)
     seen = slice(None) if len(fleet.points) else slice(1)  # pages of a channel nobody writes to take no memory
     for window, part in rasterize_windows(fleet, grid, size=_CACHED_WINDOW, gaps=gaps):
         counts[seen, *window.core] = part[seen]

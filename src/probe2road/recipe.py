@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from probe2road.clean import CleanOptions, clean_graph
 from probe2road.errors import OptionError
 from probe2road.export import read_graph
 from probe2road.fleet import Fleet, TraceGaps
-from probe2road.grid import Grid, read_raster
+from probe2road.grid import Grid, read_raster, sparse_zeros
 from probe2road.picture import Stage, write_filmstrip
 from probe2road.raster import fleet_grid, rasterize, rasterize_windows
 from probe2road.refinement import RefineOptions, refine_graph
@@ -127,9 +127,7 @@ def build(
     work.write_graph("5-cleaned", graph)
     report("graph", 1, 1)
     if options.refine:
-        refinement = options.refinement
-        if refinement.move is None:  # a network has learned where the middle of a road is; traces keep to their lanes
-            refinement = replace(refinement, move=weights is None)
+        refinement = options.refinement.for_segmenter(learned=weights is not None)
         graph = refine_graph(graph, fleet, refinement, clean=options.clean, work=work, report=report)
     work.write_graph("7-roads", graph)
     return graph
@@ -153,7 +151,7 @@ def _segment(
     """Centreline probability of the whole grid ``(rows, cols)``; pages nobody drove on are never touched."""
     if (kept := work.read_raster("1-probability", grid)) is not None:
         return kept
-    probability = np.zeros(grid.shape, np.float32)
+    probability = sparse_zeros(grid.shape, np.float32)
     driven = 0
     for window, counts in rasterize_windows(fleet, grid, size=segmenter.window, halo=segmenter.halo, gaps=gaps):
         report("segmentation", window.row, grid.rows)

@@ -7,7 +7,7 @@ which junctions are real, to drop what nobody drives, and to say how often every
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from probe2road.centreline import CentrelineOptions, refine_centreline
 from probe2road.clean import CleanOptions, clean_graph
@@ -32,10 +32,10 @@ class RefineOptions:
     gap_weight: float = 0.1  # of turning into a gap edge, where an edge of the segmentation has 1
     gaps: GapOptions = field(default_factory=GapOptions)  # which gaps are filled
     matching: MatchOptions = field(default_factory=MatchOptions)  # how traces are matched
-    min_support: int = 1  # traces that must drive on an edge for it to stay; 0 keeps all
+    min_support: int | None = None  # traces that must drive on an edge for it to stay; 0 keeps all, None is as for move
     junctions: DisambiguateOptions = field(default_factory=DisambiguateOptions)  # which junctions are split
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)  # what counts as having driven an edge
-    move: bool | None = None  # whether edges move to the middle of what was driven; None leaves it to the segmenter
+    move: bool | None = None  # whether edges move to the middle of what was driven; None: see `for_segmenter`
     centreline: CentrelineOptions = field(default_factory=CentrelineOptions)  # how far they may
 
     def __post_init__(self) -> None:
@@ -43,6 +43,18 @@ class RefineOptions:
         if not 0 < self.gap_weight <= 1:
             fix = "use a number above 0, up to 1"
             raise OptionError(f"gap_weight is {self.gap_weight}", where="RefineOptions", fix=fix)
+
+    def for_segmenter(self, *, learned: bool) -> RefineOptions:
+        """Settle what is None.
+
+        A network has learned where the middle of a road is, and what it adds to the roads are rungs and fragments that
+        nobody drives on. The lines of density lie where the traces do, and where these are few none may be matched.
+        """
+        return replace(
+            self,
+            move=not learned if self.move is None else self.move,
+            min_support=int(learned) if self.min_support is None else self.min_support,
+        )
 
 
 def refine_graph(
@@ -63,7 +75,7 @@ def refine_graph(
     fleet
         The fleet, in the graph's CRS.
     options
-        The defaults where it is None.
+        The defaults where it is None; what is None in them is settled as for the density segmenter.
     clean
         How the graph is cleaned once its gaps are filled.
     work
@@ -85,7 +97,7 @@ def refine_graph(
     -----
     Paper, section III-B; METHOD 0.1 rows 16 to 27, in the order of row 27.
     """
-    options, work = options or RefineOptions(), work or Workspace(None)
+    options, work = (options or RefineOptions()).for_segmenter(learned=False), work or Workspace(None)
     report = report or (lambda *_: None)
     if graph.edges.empty:
         return graph
@@ -102,13 +114,13 @@ def refine_graph(
 
     report("matching", 2, 4)
     matches = match(fleet, graph, options.matching)
-    driven = drop_undriven(graph, matches.steps, min_traces=options.min_support)
+    driven = drop_undriven(graph, matches.steps, min_traces=options.min_support or 0)
     report("matching", 3, 4)
     if driven is not graph:
         graph = clean_graph(driven, clean)
         matches = match(fleet, graph, options.matching)
     graph = add_evidence(graph, fleet, matches, options=options.evidence)
-    if options.move is not False:
+    if options.move:
         graph = refine_centreline(graph, fleet, matches, options=options.centreline)
     report("matching", 4, 4)
     return graph

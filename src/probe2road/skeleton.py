@@ -20,6 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OptionError
+from probe2road.grid import sparse_zeros
 
 __all__ = ["FIXED", "SET", "skeleton_pixels", "skeletonize", "skeletonize_windows", "thin_state"]
 
@@ -129,7 +130,7 @@ def skeletonize_windows(
     if window < 1 or halo < 2:
         raise OptionError(f"window is {window} and halo is {halo}", fix="use at least 1 and 2 pixels")
     if out is None:
-        out = np.zeros((rows, cols), bool)
+        out = sparse_zeros((rows, cols), bool)
     if out.shape != (rows, cols):
         raise InputError(f"out has shape {out.shape}, the mask {(rows, cols)}", fix="use the mask's shape")
     while not _thin_windows(mask, out, window, halo, _deletion_table(method)):

@@ -10,6 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from probe2road.errors import OptionError
+from probe2road.grid import sparse_zeros
 
 __all__ = ["threshold_mask"]
 
@@ -55,7 +56,7 @@ def threshold_mask(
     part = _parts(pixels, cols)
     certain = np.zeros(part.max(initial=-1) + 1, bool)
     certain[part[probability.reshape(-1)[pixels] >= seed_threshold]] = True
-    mask = np.zeros((rows, cols), bool)
+    mask = sparse_zeros((rows, cols), bool)
     mask.reshape(-1)[pixels[certain[part]]] = True
     return mask
 

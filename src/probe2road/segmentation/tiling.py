@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError
-from probe2road.grid import Grid, Window
+from probe2road.grid import Grid, Window, sparse_zeros
 from probe2road.segmentation.segmenter import Segmenter
 
 __all__ = ["add_window", "predict_window", "raster_windows", "segment_raster"]
@@ -75,7 +75,7 @@ def segment_raster(segmenter: Segmenter, counts: NDArray[Any], grid: Grid) -> ND
         raise InputError(
             f"{faulty} values are negative, NaN or infinite", where="raster", fix="give counts, with 0 for no data"
         )
-    probability = np.zeros(grid.shape, np.float32)
+    probability = sparse_zeros(grid.shape, np.float32)
     for window, part in raster_windows(counts, grid, size=segmenter.window, halo=segmenter.halo):
         add_window(probability, predict_window(segmenter, window, part, grid), window, segmenter)
     return probability
