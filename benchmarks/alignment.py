@@ -1,6 +1,6 @@
 """What alignment does to simulated raw fleets, measured against their true poses.
 
-    python benchmarks/alignment.py /tmp/benchmark/columbus --area 327000 4424000 329000 4425500 --every 4
+    python benchmarks/alignment.py sets/columbus --area 327000 4424000 329000 4425500 --every 4
     python benchmarks/alignment.py --simulate open_sky --area 327000 4424000 329000 4425500 --km 120
 
 The first form reads a prepared data set, the second one drives the Columbus network in that area anew. Prints, before
