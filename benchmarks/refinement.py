@@ -1,9 +1,9 @@
 """What each step of the refinement gives on the benchmark's test cities: the rows of the paper's Table V, and ours.
 
-Usage: python benchmarks/refinement.py FOLDER [NAMES...] [--pictures docs/img]
+Usage: python benchmarks/refinement.py FOLDER [NAMES...] [--segmenter network] [--pictures docs/img]
 
-FOLDER holds the data sets that `probe2road benchmark prepare` made. The density segmenter builds from the aligned
-fleet data; scores are against the reference kept where at least four drives pass. Prints Markdown.
+FOLDER holds the data sets that `probe2road benchmark prepare` made. Graphs are built from the aligned fleet data;
+scores are against the reference kept where at least four drives pass. Prints Markdown.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from probe2road.disambiguate import DisambiguateOptions, split_false_junctions
 from probe2road.evidence import add_evidence
 from probe2road.export import read_graph
 from probe2road.fleet import Fleet
-from probe2road.gaps import fill_gaps, gap_weights, prune_gaps
+from probe2road.gaps import drop_undriven, fill_gaps, gap_weights, prune_gaps
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.mapmatch import match
 from probe2road.metrics import evaluate
@@ -49,6 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", default=CITIES)
+    parser.add_argument("--segmenter", default="density", choices=("density", "network"))
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the densest interchanges")
     arguments = parser.parse_args()
     for name in arguments.names:
@@ -56,7 +57,7 @@ def main() -> None:
         fleet = read_fleet(folder / "aligned.parquet", folder / "aligned.points.parquet")
         reference = labelled_reference(read_graph(folder / "reference.gpkg"))
         print(f"\n## {name}\n\n| step | GEO F1/P/R | iTOPO F1/P/R | TOPO F1 | nodes | km | s |\n|{'---|' * 7}")
-        done = rows(fleet)
+        done = rows(fleet, arguments.segmenter)
         for row in done:
             print(line(row, reference), flush=True)
         for number, place in enumerate(PLACES.get(name, ())) if arguments.pictures else ():
@@ -72,7 +73,7 @@ def around(place: tuple[float, float], fleet: Fleet) -> tuple[float, float, floa
     return x[0] - REACH, y[0] - REACH, x[0] + REACH, y[0] + REACH
 
 
-def rows(fleet: Fleet) -> list[Row]:
+def rows(fleet: Fleet, segmenter: str) -> list[Row]:
     """Refine step by step."""
     done, started = [], time.perf_counter()
 
@@ -81,7 +82,7 @@ def rows(fleet: Fleet) -> list[Row]:
         done.append(Row(step, graph, time.perf_counter() - started))
         started = time.perf_counter()
 
-    built = build(fleet, BuildOptions(segmenter="density", refine=False))
+    built = build(fleet, BuildOptions(segmenter=segmenter, refine=False))
     note("no post-processing", built)
     filled = fill_gaps(built)
     matches = match(fleet, filled, edge_weights=gap_weights(filled))
@@ -95,6 +96,9 @@ def rows(fleet: Fleet) -> list[Row]:
     split = split_false_junctions(graph, matches.steps, positions=positions)
     note("guarded, with heights", split)
     matches = match(fleet, split)
+    if segmenter == "network":
+        note("undriven edges dropped", clean_graph(drop_undriven(split, matches.steps)))
+        return done
     note("centrelines moved", refine_centreline(add_evidence(split, fleet, matches), fleet, matches))
     return done
 
