@@ -22,6 +22,12 @@ from probe2road.training.scene import Scene, rows_around
 __all__ = ["Sample", "SampleOptions", "Vectors", "draw_sample", "sample_vectors", "square", "square_vectors"]
 
 _ROTATIONS = ("none", "right_angles", "any")
+# Places to columns and rows, turned by no, one, two and three right angles.
+_TURNS = np.array([[[1, 0], [0, -1]], [[0, 1], [1, 0]], [[-1, 0], [0, 1]], [[0, -1], [-1, 0]]], np.float64)
+_SEGMENT = 150.0  # m; a longer step is no segment (`probe2road.fleet.TraceGaps.max_step`)
+_LATE = 5.0  # s; a longer interval is a gap (`probe2road.fleet.TraceGaps.max_interval`)
+_LATE_INTERVALS = 3.0  # or as many times the interval between fixes, where that is more
+_FAST = 40.0  # m/s; with sparse fixes a segment may be as long as what is driven so fast in one interval
 
 
 @dataclass(frozen=True)
@@ -138,7 +144,7 @@ def sample_vectors(scene: Scene, rng: np.random.Generator, options: SampleOption
     offset = rng.normal(0.0, rng.choice(options.offsets), (scene.n_drives, 2)).astype(np.float32)
     reach = options.size * 0.75 + 4 * float(np.abs(offset).max(initial=0.0)) + _SEGMENT
     interval, phase = float(rng.choice(options.intervals)), rng.random(scene.n_drives).astype(np.float32)
-    fixes, late = _fixes(scene, frame, kept, reach), max(_LATE, 3 * interval)
+    fixes, late = _fixes(scene, frame, kept, reach), max(_LATE, _LATE_INTERVALS * interval)
     fixes = fixes[_sampled(scene.fix_drive[fixes], scene.fix_time[fixes], interval, phase)]
     points = _points(scene, frame, kept, reach)
     points = points[rng.random(len(points)) < rng.uniform(options.least_points, 1.0)]
@@ -163,11 +169,6 @@ def square_vectors(scene: Scene, centre: tuple[float, float], options: SampleOpt
     fixes, points = _fixes(scene, frame, kept, reach), _points(scene, frame, kept, reach)
     offset = np.zeros((scene.n_drives, 2), np.float32)
     return _vectors(scene, frame, fixes, points, offset, _LATE, _labelled(scene, kept, options))
-
-
-_TURNS = np.array(
-    [[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]], [[-1.0, 0.0], [0.0, 1.0]], [[0.0, -1.0], [-1.0, 0.0]]]
-)
 
 
 def _turn(rng: np.random.Generator, options: SampleOptions) -> NDArray[np.float64]:
@@ -244,10 +245,6 @@ def _vectors(
     )  # fmt: skip
 
 
-_SEGMENT = 150.0  # m; a longer step is no segment (`probe2road.fleet.TraceGaps.max_step`)
-_LATE = 5.0  # s; a gap (`probe2road.fleet.TraceGaps.max_interval`)
-
-
 @njit(cache=True)
 def _sampled(
     drive: NDArray[np.int32], time: NDArray[np.float32], interval: float, phase: NDArray[np.float32]
@@ -269,6 +266,6 @@ def _breaks(
     """Mark fixes that no segment reaches from the fix before: another drive, a gap in time, or too long a step."""
     breaks = np.ones(len(drive), bool)
     step = np.hypot(*np.diff(xy, axis=0).T)
-    limit = max(_SEGMENT, late / 3 * 40.0)
+    limit = max(_SEGMENT, _FAST * late / _LATE_INTERVALS)
     breaks[1:] = (np.diff(drive) != 0) | (np.diff(time) > late) | (step > limit)
     return breaks
