@@ -12,9 +12,7 @@ moves of a tile are one array in the workspace, so an interrupted run goes on wi
 from __future__ import annotations
 
 import logging
-import multiprocessing
 from collections.abc import Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,13 +23,13 @@ from probe2road.alignment.keyframes import wrapped
 from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.screening import rows_of_points
 from probe2road.fleet import Fleet
+from probe2road.workers import in_processes
 from probe2road.workspace import Progress, Workspace
 
 __all__ = ["Moves", "Tile", "align_tiles", "find_tiles", "moved_fleet"]
 
 logger = logging.getLogger(__name__)
 
-_AHEAD = 2  # tiles cut out for the workers in advance, beside those in work
 _LEAST_WEIGHT = 1e-3  # at the border of a tile that has no neighbour there
 
 
@@ -217,7 +215,7 @@ def _results(
         logger.info("taking %d of %d tiles from an earlier run", len(tiles) - len(missing), len(tiles))
     point_rows = rows_of_points(fleet)
     jobs = ((tile, *_cut(fleet, usable, held, point_rows, tile), options) for tile in missing)
-    made = (_align_tile(*job) for job in jobs) if workers == 1 else _in_processes(jobs, workers)
+    made = (_align_tile(*job) for job in jobs) if workers == 1 else in_processes(_align_tile, jobs, workers)
     for tile, (moves, seen) in zip(missing, made, strict=True):
         workspace.write_array(f"{tile.name}-residuals", seen)
         workspace.write_array(f"{tile.name}-moves", moves)
@@ -275,23 +273,3 @@ def _fix_moves(part: Fleet, area: AlignedArea) -> NDArray[np.float64]:
         shift[:, 2] += weight * turn
         shift[:, 3] += weight * dz[k]
     return shift
-
-
-def _in_processes(
-    jobs: Iterator[tuple[Tile, Fleet, NDArray[np.int64], NDArray[np.bool_], AlignOptions]], workers: int
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Align tiles in worker processes and yield the results in order, never more than a few tiles ahead."""
-    # Spawned, not forked: the parent may hold threads of numba or pyarrow.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context) as pool:
-        waiting: list[Future[tuple[NDArray[np.float64], NDArray[np.float64]]]] = []
-        try:
-            for job in jobs:
-                waiting.append(pool.submit(_align_tile, *job))
-                if len(waiting) >= workers + _AHEAD:
-                    yield waiting.pop(0).result()
-            while waiting:
-                yield waiting.pop(0).result()
-        finally:
-            for future in waiting:
-                future.cancel()

@@ -7,9 +7,7 @@ therefore does not depend on how many workers share the drives, and drive 1000 c
 from __future__ import annotations
 
 import logging
-import multiprocessing
-from collections.abc import Generator, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import count
@@ -30,6 +28,7 @@ from probe2road.simulate.odometry import fuse
 from probe2road.simulate.presets import Preset, RecordingModel, SurroundingsModel, find_preset
 from probe2road.simulate.records import DriveLabels, RecordedPoses, count_drives, drive_tables
 from probe2road.simulate.traffic import TrafficWorld, TruePoses, drive, traffic_world
+from probe2road.workers import in_processes
 
 __all__ = [
     "FleetChunk",
@@ -45,7 +44,6 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 _WORLD, _DRIVE, _VEHICLE = 0, 1, 2  # first key of the random streams
-_AHEAD = 2  # chunks in work for each worker, beyond those being collected
 
 
 @dataclass(frozen=True)
@@ -204,7 +202,9 @@ def simulate_chunks(
     world = fleet_world(network, find_preset(preset), seed=seed)
     end = None if n_drives is None else first_drive + n_drives
     jobs = _jobs(first_drive, end, chunk_drives)
-    results = (_chunk(world, *job) for job in jobs) if workers == 1 else _in_processes(world, jobs, workers)
+    results = (_chunk(world, *job) for job in jobs)
+    if workers > 1:
+        results = in_processes(_chunk_in_worker, jobs, workers, initializer=_start_worker, initargs=(world,))
     with closing(results):  # ends the workers where the caller stops early
         yield from _until(results, None if drive_km is None else drive_km * 1000.0)
 
@@ -368,25 +368,5 @@ def _start_worker(world: FleetWorld) -> None:
 
 def _chunk_in_worker(start: int, end: int) -> FleetChunk:
     if _worker_world is None:
-        raise RuntimeError("the worker process has not been started by _in_processes")
+        raise RuntimeError("the worker process has not been started by in_processes")
     return _chunk(_worker_world, start, end)
-
-
-def _in_processes(
-    world: FleetWorld, jobs: Iterable[tuple[int, int]], workers: int
-) -> Generator[FleetChunk, None, None]:
-    """Simulate chunks in worker processes and yield them in order, never more than a few ahead."""
-    # Spawned, not forked: the parent may hold threads of numba or pyarrow.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(world,)) as pool:
-        waiting: list[Future[FleetChunk]] = []
-        try:
-            for job in jobs:
-                waiting.append(pool.submit(_chunk_in_worker, *job))
-                if len(waiting) >= workers + _AHEAD:
-                    yield waiting.pop(0).result()
-            while waiting:
-                yield waiting.pop(0).result()
-        finally:
-            for future in waiting:
-                future.cancel()
