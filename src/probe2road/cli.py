@@ -154,12 +154,13 @@ def align(
     from probe2road.align import AlignOptions, add_drives
     from probe2road.align import align as align_fleet
     from probe2road.alignment.report import draw_alignment, write_report
+    from probe2road.io.fleet_reader import read_fleet_files
     from probe2road.io.fleet_writer import write_fleet
     from probe2road.options import load_options
 
     options = load_options(config, AlignOptions) if config else AlignOptions()
     options = replace(options, keep_rejected=False) if drop_rejected else options
-    base = _read_aligned(add_to) if add_to else None
+    base = read_fleet_files(add_to) if add_to else None
     work_crs = base.crs.to_wkt() if base else None
     fleet = _read_fleet(traces, points, columns, point_columns, crs, bbox, delimiter, no_header, work_crs)
     workspace = output.parent / f".{output.name}.probe2road"
@@ -444,15 +445,6 @@ def _network_choice(
         raise OptionError(f"segmenter {segmenter} runs no network", where=option, fix="use --segmenter network")
     file = str(weights) if weights else network.weights
     return {"segmenter": "network", "network": replace(network, weights=file, device=device or network.device)}
-
-
-def _read_aligned(path: Path) -> Fleet:
-    """Read what `align` wrote: the traces, and the points beside them where there are any."""
-    from probe2road.io.fleet_reader import read_fleet
-    from probe2road.io.fleet_writer import points_path
-
-    points = points_path(path)
-    return read_fleet(path, points if points.exists() else None)
 
 
 def _column_map(text: str | None, option: str) -> dict[str, str]:

@@ -11,8 +11,8 @@ import pandas as pd
 from probe2road.errors import OutputError
 from probe2road.export import write_graph
 from probe2road.fleet import Fleet
-from probe2road.io.fleet_reader import read_fleet
-from probe2road.io.fleet_writer import points_path, write_fleet
+from probe2road.io.fleet_reader import read_fleet_files
+from probe2road.io.fleet_writer import write_fleet
 from probe2road.metrics import evaluate
 from probe2road.recipe import Progress, build, draw_stages
 from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
@@ -79,7 +79,7 @@ def run_demo(folder: str | Path, *, progress: Progress | None = None) -> tuple[d
     write_fleet(simulated.fleet, drives)
     write_graph(simulated.reference, truth)
 
-    fleet = read_fleet(drives, points_path(drives))
+    fleet = read_fleet_files(drives)
     graph = build(fleet, workspace=folder / "stages", progress=progress)
     write_graph(graph, roads)
     scores = evaluate(graph, simulated.reference, metrics=["geo", "itopo"])

@@ -53,7 +53,6 @@ def fill_gaps(graph: RoadGraph, *, options: GapOptions | None = None) -> RoadGra
        split there;
     3. the nearest edge within ``beside`` that runs along it, as a mainline beside the end of its ramp, joined a
        little ahead. The paper does not have this rule; ``beside=0`` switches it off.
-
     4. Junctions are joined where roads that end in them face each other (`probe2road.gap_stems`), as where the piece
        between two carriageways is lost. The paper does not have this rule; ``stem_turn=0`` switches it off.
 
@@ -172,8 +171,7 @@ def prune_gaps(graph: RoadGraph, steps: pd.DataFrame, *, min_traces: int = 4) ->
     if min_traces < 0:
         raise OptionError(f"min_traces is {min_traces}", where="prune_gaps", fix="use a number that is not negative")
     through = steps[steps["entered"].astype(bool) & steps["left"].astype(bool)]
-    traces = through.groupby("edge")["trace_id"].nunique().reindex(graph.edges.index, fill_value=0)
-    dropped = ((graph.edges["origin"] == "gap") & (traces < min_traces)).to_numpy()
+    dropped = (graph.edges["origin"] == "gap").to_numpy() & (_distinct_traces(graph, through) < min_traces)
     why = f"of origin gap with fewer than {min_traces} traces"
     return merge_degree_two_nodes(drop_edges(graph, dropped, why=why))
 
@@ -209,8 +207,14 @@ def drop_undriven(graph: RoadGraph, steps: pd.DataFrame, *, min_traces: int = 1)
     """
     if min_traces < 0:
         raise OptionError(f"min_traces is {min_traces}", where="drop_undriven", fix="use a number that is not negative")
-    traces = steps.groupby("edge")["trace_id"].nunique().reindex(graph.edges.index, fill_value=0)
-    return drop_edges(graph, (traces < min_traces).to_numpy(), why=f"that fewer than {min_traces} traces drove on")
+    dropped = _distinct_traces(graph, steps) < min_traces
+    return drop_edges(graph, dropped, why=f"that fewer than {min_traces} traces drove on")
+
+
+def _distinct_traces(graph: RoadGraph, steps: pd.DataFrame) -> NDArray[np.int64]:
+    """Count the traces with a step on each edge."""
+    traces = steps.groupby("edge")["trace_id"].nunique()
+    return traces.reindex(graph.edges.index, fill_value=0).to_numpy(np.int64)
 
 
 def _chosen(ends: DeadEnds, links: Links, options: GapOptions) -> Links:

@@ -26,7 +26,7 @@ from probe2road.segmentation.tiling import add_window, predict_window
 from probe2road.segmentation.weights import Weights
 from probe2road.skeleton import skeletonize_windows
 from probe2road.vectorize import VectorizeOptions, vectorize
-from probe2road.workspace import Progress, Workspace, open_workspace
+from probe2road.workspace import Progress, Workspace, open_workspace, silent
 
 __all__ = ["SEGMENTERS", "BuildOptions", "Progress", "build", "draw_stages"]
 
@@ -105,7 +105,7 @@ def build(
     >>> graph.length > 3000
     True
     """
-    options, report = options or BuildOptions(), progress or _silent
+    options, report = options or BuildOptions(), progress or silent
     grid = fleet_grid(fleet, resolution=options.resolution)
     learned = options.segmenter == "network" or (options.segmenter == "auto" and len(fleet.points) > 0)
     weights = find_weights(fleet, options.network) if learned else None
@@ -199,7 +199,3 @@ def draw_stages(folder: str | Path, fleet: Fleet, path: str | Path) -> None:
         Stage("Roads", read_graph(folder / "7-roads.gpkg")),
     ]
     write_filmstrip(panels, path)
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    """Report nothing."""

@@ -19,7 +19,7 @@ from probe2road.gaps import GapOptions, drop_undriven, fill_gaps, gap_weights, p
 from probe2road.mapmatch import MatchOptions, match
 from probe2road.passages import passing_positions
 from probe2road.roadgraph import RoadGraph
-from probe2road.workspace import Progress, Workspace
+from probe2road.workspace import Progress, Workspace, silent
 
 __all__ = ["RefineOptions", "refine_graph"]
 
@@ -98,7 +98,7 @@ def refine_graph(
     Paper, section III-B; METHOD 0.1 rows 16 to 27, in the order of row 27.
     """
     options, work = (options or RefineOptions()).for_segmenter(learned=False), work or Workspace(None)
-    report = report or (lambda *_: None)
+    report = report or silent
     if graph.edges.empty:
         return graph
     report("matching", 0, 4)

@@ -29,12 +29,17 @@ from probe2road.roadgraph import RoadGraph
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["Progress", "Workspace", "fingerprint", "open_workspace"]
+__all__ = ["Progress", "Workspace", "fingerprint", "open_workspace", "silent"]
 
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage, how much of it is done, and how much there is."""
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Report nothing: the progress of a run that nobody follows."""
+
 
 _MARK = "run.json"
 _FORMAT = 2  # raised when what a stage writes changes

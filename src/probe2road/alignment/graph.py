@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from probe2road.alignment.keyframes import Keyframes
 from probe2road.alignment.lines import Condensed
 from probe2road.alignment.options import AlignOptions
-from probe2road.errors import MissingExtraError
+from probe2road.errors import needs_extra
 
 __all__ = ["optimise"]
 
@@ -69,10 +69,8 @@ def optimise(
     MissingExtraError
         If GTSAM is not installed.
     """
-    try:
+    with needs_extra("align", feature="aligning a fleet"):
         import gtsam
-    except ImportError as error:
-        raise MissingExtraError.for_extra("align", feature="aligning a fleet") from error
     held = np.zeros(len(pose), bool) if held is None else held
     fixed = np.zeros(len(patch_pose), bool) if fixed_patch is None else fixed_patch
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()

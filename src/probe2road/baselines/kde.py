@@ -18,7 +18,7 @@ from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, TraceGaps
 from probe2road.raster import fleet_grid
 from probe2road.roadgraph import RoadGraph
-from probe2road.workspace import Progress, open_workspace
+from probe2road.workspace import Progress, open_workspace, silent
 
 __all__ = ["KdeOptions", "build_kde"]
 
@@ -94,7 +94,7 @@ def build_kde(
     >>> graph.length > 2000
     True
     """
-    options, report = options or KdeOptions(), progress or _silent
+    options, report = options or KdeOptions(), progress or silent
     grid = fleet_grid(fleet, resolution=options.resolution)
     work = open_workspace(workspace, fleet, options)
     if (kept := work.read_graph("2-roads")) is not None:
@@ -117,7 +117,3 @@ def build_kde(
     work.write_graph("2-roads", graph)
     report("graph", 1, 1)
     return graph
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    """Report nothing."""

@@ -17,11 +17,12 @@ from probe2road.errors import CRSError, InputError, OptionError
 from probe2road.fleet import Fleet, fleet_from_checked
 from probe2road.fleet_tables import check_points, check_traces
 from probe2road.io.delimited import read_text_table
+from probe2road.io.fleet_writer import points_path
 from probe2road.io.gpx import read_gpx
 from probe2road.io.parquet import BBox, inside, read_parquet
 from probe2road.io.sources import RawTable, SourceFile, find_sources
 
-__all__ = ["read_fleet"]
+__all__ = ["read_fleet", "read_fleet_files"]
 
 logger = logging.getLogger(__name__)
 
@@ -132,6 +133,29 @@ class _Options:
     bbox: BBox | None
     delimiter: str | None
     header: bool
+
+
+def read_fleet_files(path: str | PathLike[str]) -> Fleet:
+    """Read what `probe2road.io.fleet_writer.write_fleet` wrote: traces, and the points beside them if there are any.
+
+    Raises
+    ------
+    InputError
+        As `read_fleet`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from probe2road.demo import demo_fleet
+    >>> from probe2road.io.fleet_writer import write_fleet
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     written = write_fleet(demo_fleet(n_drives=2), f"{folder}/drives.parquet")
+    ...     fleet = read_fleet_files(f"{folder}/drives.parquet")
+    >>> fleet.n_traces, len(fleet.points) > 0
+    (2, True)
+    """
+    points = points_path(path)
+    return read_fleet(path, points if points.exists() else None)
 
 
 def _checked_bbox(bbox: Sequence[float]) -> BBox:

@@ -18,8 +18,7 @@ from probe2road.benchmark.reference import labelled_reference
 from probe2road.benchmark.tiles import split_area
 from probe2road.errors import InputError, OptionError
 from probe2road.export import read_graph
-from probe2road.io.fleet_reader import read_fleet
-from probe2road.io.fleet_writer import points_path
+from probe2road.io.fleet_reader import read_fleet, read_fleet_files
 from probe2road.labels import LabelOptions, label_pieces
 from probe2road.roadgraph import RoadGraph
 from probe2road.training.scene import Scene, load_scene, make_scene, save_scene
@@ -128,8 +127,7 @@ def _make(source: Source, sets: Path) -> Scene:
         return make_scene(fleet, pieces, driven)
     recording = _recording(source, sets)
     path = recording.aligned if source.data == "aligned" else recording.drives
-    points = points_path(path)
-    fleet = read_fleet(path, points if points.exists() else None)
+    fleet = read_fleet_files(path)
     driven = pd.read_parquet(recording.routes).rename(columns={"section": "edge"})
     area = split_area(read_tiles(recording.folder), source.split) if source.split else None
     return make_scene(fleet, read_graph(recording.reference), driven, area=area)

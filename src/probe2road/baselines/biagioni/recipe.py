@@ -25,7 +25,7 @@ from probe2road.grid import Grid
 from probe2road.matching.models import PublishedModel
 from probe2road.raster import fleet_grid
 from probe2road.roadgraph import RoadGraph
-from probe2road.workspace import Progress, Workspace, open_workspace
+from probe2road.workspace import Progress, Workspace, open_workspace, silent
 
 __all__ = ["FLEET", "SIGMAS", "BiagioniOptions", "build_biagioni"]
 
@@ -113,7 +113,7 @@ def build_biagioni(
     >>> graph.length > 2000
     True
     """
-    options, report = options or BiagioniOptions(), progress or _silent
+    options, report = options or BiagioniOptions(), progress or silent
     grid = fleet_grid(fleet, resolution=options.resolution)
     work = open_workspace(workspace, fleet, options)
     if (kept := work.read_graph("5-roads")) is not None:
@@ -168,7 +168,3 @@ def _match(observations: Observations, graph: RoadGraph, weight: NDArray[np.floa
         max_error=options.run_error,
         last_runs=options.last_runs,
     )
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    """Report nothing."""

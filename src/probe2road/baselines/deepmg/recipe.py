@@ -23,7 +23,7 @@ from probe2road.grid import Grid
 from probe2road.raster import fleet_grid
 from probe2road.roadgraph import RoadGraph
 from probe2road.segmentation.mask import threshold_mask
-from probe2road.workspace import Progress, Workspace, open_workspace
+from probe2road.workspace import Progress, Workspace, open_workspace, silent
 
 __all__ = ["DeepMGOptions", "build_deepmg"]
 
@@ -99,7 +99,7 @@ def build_deepmg(
     -----
     Ruan et al., "Learning to Generate Maps from Trajectories", AAAI 2020; METHOD 3.
     """
-    options, report = options or DeepMGOptions(), progress or (lambda *_: None)
+    options, report = options or DeepMGOptions(), progress or silent
     work = open_workspace(workspace, fleet, _Run(options, _digest(options.weights)))
     if (graph := work.read_graph("7-roads")) is not None:
         return graph
