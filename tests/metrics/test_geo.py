@@ -9,7 +9,10 @@ from scipy.optimize import linear_sum_assignment
 
 from probe2road.errors import CRSError, OptionError
 from probe2road.metrics import HE_BALAKRISHNAN_2022, GeoOptions, comparable, geo, scores_table
+from probe2road.metrics.geo import geo_networks, geo_samples
+from probe2road.metrics.matching import Matching
 from probe2road.metrics.network import network_from_graph
+from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import sample_edges
 from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
 
@@ -182,3 +185,31 @@ def test_parameters_stand_in_the_row() -> None:
 def test_options_out_of_range_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(OptionError, match="GeoOptions"):
         GeoOptions(**options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("matching", ["greedy", "global", "optimal"])
+@pytest.mark.parametrize("seed", range(3))
+def test_samples_add_up_to_the_counts(seed: int, matching: Matching, streets: Streets) -> None:
+    sides = comparable_networks(streets(seed), streets(seed + 100))
+    options = GeoOptions(matching=matching)
+    score, samples = geo_networks(*sides, options), geo_samples(*sides, options)
+    assert (samples.proposal_matched.sum(), len(samples.proposal_xy)) == (score.matched_proposal, score.proposal)
+    assert (samples.reference_matched.sum(), len(samples.reference_xy)) == (score.matched_reference, score.reference)
+
+
+def test_samples_say_where_a_road_is_missing() -> None:
+    reference = graph([(0, 0), (22, 0)], [(0, 0), (0, 22)])
+    samples = geo_samples(*comparable_networks(graph([(0, 0), (22, 0)]), reference), GeoOptions())
+    assert samples.proposal_matched.all()
+    missed = samples.reference_xy[~samples.reference_matched]
+    assert sorted(missed.tolist()) == [[0.0, 11.0], [0.0, 22.0]]
+
+
+@pytest.mark.parametrize("empty_side", [0, 1])
+def test_an_empty_network_has_no_samples(empty_side: int, streets: Streets) -> None:
+    sides = [streets(1), streets(1)]
+    sides[empty_side] = empty_graph(CRS)
+    samples = geo_samples(*comparable_networks(*sides), GeoOptions())
+    assert not samples.proposal_matched.any()
+    assert not samples.reference_matched.any()
+    assert [samples.proposal_xy, samples.reference_xy][empty_side].shape == (0, 2)

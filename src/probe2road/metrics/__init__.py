@@ -9,9 +9,9 @@ from __future__ import annotations
 from probe2road.metrics.apls import AplsOptions, apls
 from probe2road.metrics.buffer import BufferGeoOptions, buffer_geo
 from probe2road.metrics.evaluate import DEFAULT_METRICS, METRICS, evaluate
-from probe2road.metrics.geo import HE_BALAKRISHNAN_2022, GeoOptions, geo
+from probe2road.metrics.geo import HE_BALAKRISHNAN_2022, GeoOptions, GeoSamples, geo, geo_samples
 from probe2road.metrics.graph_sampling import GraphSamplingOptions, graph_sampling
-from probe2road.metrics.itopo import ItopoOptions, itopo
+from probe2road.metrics.itopo import ItopoOptions, Pairs, itopo, itopo_pairs
 from probe2road.metrics.normalise import clip_graph, comparable
 from probe2road.metrics.scores import SCORE_DTYPES, Score, scores_table
 from probe2road.metrics.soft_f1 import soft_f1
@@ -25,8 +25,10 @@ __all__ = [
     "AplsOptions",
     "BufferGeoOptions",
     "GeoOptions",
+    "GeoSamples",
     "GraphSamplingOptions",
     "ItopoOptions",
+    "Pairs",
     "Score",
     "TopoOptions",
     "apls",
@@ -35,8 +37,10 @@ __all__ = [
     "comparable",
     "evaluate",
     "geo",
+    "geo_samples",
     "graph_sampling",
     "itopo",
+    "itopo_pairs",
     "scores_table",
     "soft_f1",
     "topo",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probe2road.errors import OptionError
 from probe2road.metrics.matching import Matching, candidate_pairs, match_one_to_one, require_positive
@@ -14,7 +15,7 @@ from probe2road.metrics.sampling import Samples, sample_edges
 from probe2road.metrics.scores import Score
 from probe2road.roadgraph import RoadGraph
 
-__all__ = ["HE_BALAKRISHNAN_2022", "GeoOptions", "geo", "geo_networks"]
+__all__ = ["HE_BALAKRISHNAN_2022", "GeoOptions", "GeoSamples", "geo", "geo_networks", "geo_samples"]
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,24 @@ class GeoOptions:
         require_positive("GeoOptions", spacing=self.spacing, radius=self.radius, phases=self.phases)
         if self.matching not in ("greedy", "global", "optimal"):
             raise OptionError(f"matching is {self.matching!r}", where="GeoOptions", fix="use greedy, global or optimal")
+
+
+@dataclass(frozen=True)
+class GeoSamples:
+    """The samples behind a score, with their places: A of the proposal, B of the reference.
+
+    Attributes
+    ----------
+    proposal_xy, reference_xy
+        Shapes (A, 2) and (B, 2), metres.
+    proposal_matched, reference_matched
+        Shapes (A,) and (B,): whether the sample has a partner on the other side. Both sum to the same number.
+    """
+
+    proposal_xy: NDArray[np.float64]
+    proposal_matched: NDArray[np.bool_]
+    reference_xy: NDArray[np.float64]
+    reference_matched: NDArray[np.bool_]
 
 
 # METHOD 6.1 (a), with the direction test of its second version. Their strict "<" makes no difference to real data.
@@ -84,9 +103,9 @@ def geo_networks(proposal: Network, reference: Network, options: GeoOptions) -> 
     matched = proposed = 0
     for phase in range(options.phases):
         shift = options.spacing * (1.0 - phase / options.phases)
-        samples = sample_edges(proposal, options.spacing, shift=shift)
-        matched += _count_matches(samples, targets, options)
-        proposed += len(samples.edge)
+        samples = _match_samples(sample_edges(proposal, options.spacing, shift=shift), targets, options)
+        matched += int(samples.proposal_matched.sum())
+        proposed += len(samples.proposal_matched)
     return Score.from_counts(
         "geo",
         matched_proposal=matched,
@@ -98,7 +117,25 @@ def geo_networks(proposal: Network, reference: Network, options: GeoOptions) -> 
     )
 
 
-def _count_matches(samples: Samples, targets: Samples, options: GeoOptions) -> int:
+def geo_samples(proposal: Network, reference: Network, options: GeoOptions) -> GeoSamples:
+    """Return where each sample of normalised networks lies and whether it matched, for maps and resampling.
+
+    Only the first sampling origin is taken, whatever ``options.phases``: with one phase the sums over the samples
+    are the counts of `geo_networks`. An empty network has no samples.
+
+    Examples
+    --------
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> sides = [graph_from_lines([[(0, 0), (end, 0)]], crs="EPSG:32616") for end in (6, 12)]
+    >>> samples = geo_samples(*comparable_networks(*sides), GeoOptions())
+    >>> samples.reference_xy[:, 0].tolist(), samples.reference_matched.tolist()
+    ([0.0, 11.0, 12.0], [True, True, False])
+    """
+    return _match_samples(sample_edges(proposal, options.spacing), sample_edges(reference, options.spacing), options)
+
+
+def _match_samples(samples: Samples, targets: Samples, options: GeoOptions) -> GeoSamples:
+    """Match the samples of one sampling origin."""
     pairs = candidate_pairs(
         samples.xy,
         targets.xy,
@@ -108,4 +145,6 @@ def _count_matches(samples: Samples, targets: Samples, options: GeoOptions) -> i
         max_angle=options.max_angle,
     )
     partner = match_one_to_one(pairs, (len(samples.edge), len(targets.edge)), how=options.matching)
-    return int(np.count_nonzero(partner >= 0))
+    taken = np.zeros(len(targets.edge), np.bool_)
+    taken[partner[partner >= 0]] = True
+    return GeoSamples(samples.xy, partner >= 0, targets.xy, taken)
