@@ -2,12 +2,15 @@
 
     python benchmarks/alignment.py sets/columbus --area 327000 4424000 329000 4425500 --every 4
     python benchmarks/alignment.py --simulate open_sky --area 327000 4424000 329000 4425500 --km 120
+    python benchmarks/alignment.py sets/boston --aligned boston.parquet sets/boston/aligned.parquet
 
-The first form reads a prepared data set, the second one drives the Columbus network in that area anew. Prints, before
-and after: the error of trajectories (root mean square, m), the median lateral error, the same where 15 drives or more
-pass, the median error along, the robust standard deviation between the drives at a place (25 m of one road) of the
-lateral, the longitudinal and the vertical error, and the share of drives of which more than half is nearer to the
-neighbouring lane than to its own, as the others see it. `--picture` draws the busiest place.
+The first form aligns a part of a prepared data set, the second one drives the Columbus network in that area anew and
+aligns that, and the third one scores files that `probe2road align` wrote, or the aligned data of the set, as a whole.
+Prints, before and after: the error of trajectories (root mean square, m), the median lateral error, the same where 15
+drives or more pass, the median error along, the robust standard deviation between the drives at a place (25 m of one
+road) of the lateral, the longitudinal and the vertical error, the share of drives of which more than half is nearer to
+the neighbouring lane than to its own, as the others see it, and the share of all poses that are. The last line counts
+what the shares are of: drives that five or more pass with somewhere. `--picture` draws the busiest place.
 """
 
 from __future__ import annotations
@@ -26,8 +29,10 @@ import shapely
 from probe2road.align import align
 from probe2road.alignment.report import draw_alignment
 from probe2road.benchmark.datasets import find_dataset, load_network
+from probe2road.benchmark.recording import Recording
 from probe2road.fleet import Fleet
 from probe2road.io.fleet_reader import read_fleet
+from probe2road.io.fleet_writer import points_path
 from probe2road.simulate.fleet_simulation import simulate
 
 HALF_LANE = 1.75  # m
@@ -37,15 +42,20 @@ FEW, MANY = 5, 15  # drives at a place
 
 def recorded(folder: Path, area: tuple[float, float, float, float], every: int) -> tuple[Fleet, pd.DataFrame]:
     """Every n-th drive of a data set within an area, and its true poses, row by row."""
-    fleet = read_fleet(folder / "drives.parquet", folder / "drives.points.parquet", bbox=area)
+    recording = Recording(folder)
+    fleet = read_fleet(recording.drives, points_path(recording.drives), bbox=area)
     keep = [table["trace_id"] % every == 0 for table in (fleet.traces, fleet.points)]
     traces, points = fleet.traces[keep[0]].reset_index(drop=True), fleet.points[keep[1]].reset_index(drop=True)
-    ids = traces["trace_id"].unique().tolist()
-    table = pq.read_table(folder / "poses.parquet", filters=[("trace_id", "in", ids)])
+    truth = true_poses(recording, [("trace_id", "in", traces["trace_id"].unique().tolist())])
+    return Fleet(traces, points, fleet.crs), traces[["trace_id", "t"]].merge(truth, on=["trace_id", "t"], how="left")
+
+
+def true_poses(recording: Recording, filters: list[tuple[str, str, list[int]]] | None = None) -> pd.DataFrame:
+    """True poses of a data set, with `x`, `y` and `z` for their geometry."""
+    table = pq.read_table(recording.poses, filters=filters)
     place = table.column("geometry").combine_chunks()
     axes = {axis: place.field(axis).to_numpy(zero_copy_only=False) for axis in "xyz"}
-    truth = table.drop_columns(["geometry"]).to_pandas().assign(**axes)
-    return Fleet(traces, points, fleet.crs), traces[["trace_id", "t"]].merge(truth, on=["trace_id", "t"], how="left")
+    return table.drop_columns(["geometry"]).to_pandas().assign(**axes)
 
 
 def simulated(
@@ -88,7 +98,8 @@ def figures(table: pd.DataFrame) -> dict[str, float]:
     drives = places["drive"].transform("nunique")
     shared = drives >= FEW
     between = {name: (table[name] - places[name].transform("median"))[shared] for name in ("left", "ahead", "up")}
-    off = (between["left"].abs() > HALF_LANE).groupby(table["drive"][shared]).mean() > 0.5
+    off = between["left"].abs() > HALF_LANE
+    drives_off = off.groupby(table["drive"][shared]).mean() > 0.5
     busy = table["left"][drives >= MANY].abs()
     return {
         "ATE": float(np.sqrt((table["left"] ** 2 + table["ahead"] ** 2).mean())),
@@ -96,38 +107,61 @@ def figures(table: pd.DataFrame) -> dict[str, float]:
         f"lateral, {MANY}+": float(busy.median()),
         "along": float(table["ahead"].abs().median()),
         **{f"spread {name}": 1.4826 * float(values.abs().median()) for name, values in between.items()},
-        "lane off": float(off.mean()),
+        "drives off": float(drives_off.mean()),
+        "poses off": float(off.mean()),
+        "of drives": len(drives_off),
+        "of poses": len(off),
     }
 
 
+def score_files(folder: Path, paths: list[Path]) -> pd.DataFrame:
+    """The table for the raw data of a set and for aligned files of it, none of which is in memory with another."""
+    recording = Recording(folder)
+    truth = true_poses(recording)
+    columns = {}
+    for path in (recording.drives, *paths):
+        fleet = read_fleet(path)
+        if not fleet.traces[["trace_id", "t"]].equals(truth[["trace_id", "t"]]):
+            raise SystemExit(f"{path} does not hold the fixes of {folder}, row by row")
+        columns[str(path)] = figures(errors(fleet, truth))
+    return pd.DataFrame(columns)
+
+
+def align_and_score(fleet: Fleet, truth: pd.DataFrame, picture: Path | None) -> pd.DataFrame:
+    """Align a fleet; the table before and after."""
+    cpu = time.process_time()
+    result = align(fleet)
+    cpu = time.process_time() - cpu
+    print(f"{fleet.n_traces} drives, {len(fleet.traces)} poses, {len(fleet.points)} points; {cpu:.1f} CPU-s")
+    print(result.report.summary)
+    if picture:
+        draw_alignment(fleet, result.fleet, picture)
+    return pd.DataFrame({"before": figures(errors(fleet, truth)), "after": figures(errors(result.fleet, truth))})
+
+
 def main() -> None:
-    """Align one fleet and print the table."""
+    """Print the table of one fleet."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("folder", type=Path, nargs="?", help="a prepared data set")
+    parser.add_argument("--aligned", type=Path, nargs="+", help="files to score")
     parser.add_argument("--simulate", dest="preset")
-    parser.add_argument("--area", type=float, nargs=4, required=True)
+    parser.add_argument("--area", type=float, nargs=4, help="what to align: left bottom right top")
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--km", type=float, default=120.0)
     parser.add_argument("--data", type=Path, default=Path("../shared/data/osm"))
     parser.add_argument("--picture", type=Path)
     given = parser.parse_args()
+    if (given.folder is None) == (given.preset is None) or (given.area is None) == (given.aligned is None):
+        parser.error("give a data set or --simulate, and --area, or for a data set --aligned")
     logging.basicConfig(format="%(message)s")
-    area = tuple(given.area)
-    if given.preset:
-        fleet, truth = simulated(given.preset, area, given.km, given.data)
+    if given.aligned:
+        table = score_files(given.folder, given.aligned)
+    elif given.preset:
+        table = align_and_score(*simulated(given.preset, tuple(given.area), given.km, given.data), given.picture)
     else:
-        fleet, truth = recorded(given.folder, area, given.every)
-    cpu = time.process_time()
-    result = align(fleet)
-    cpu = time.process_time() - cpu
-    table = pd.DataFrame(
-        {name: figures(errors(part, truth)) for name, part in (("before", fleet), ("after", result.fleet))}
-    )
-    print(f"{fleet.n_traces} drives, {len(fleet.traces)} poses, {len(fleet.points)} points; {cpu:.1f} CPU-s")
-    print(table.T.round(3).to_string())
-    print(result.report.summary)
-    if given.picture:
-        draw_alignment(fleet, result.fleet, given.picture)
+        table = align_and_score(*recorded(given.folder, tuple(given.area), given.every), given.picture)
+    with pd.option_context("display.width", 200, "display.max_columns", None):
+        print(table.T.round(4).to_string())
 
 
 if __name__ == "__main__":
