@@ -11,7 +11,7 @@ import shapely.affinity
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from probe2road.metrics import GeoOptions, evaluate, geo, itopo
+from probe2road.metrics import GeoOptions, evaluate, geo, itopo, junctions, lateral
 from probe2road.roadgraph import RoadGraph, graph_from_lines
 
 CRS = "EPSG:32616"
@@ -41,6 +41,17 @@ def graph(lines: list[Any]) -> RoadGraph:
 def test_a_graph_against_itself_scores_one(lines: list[Any]) -> None:
     table = evaluate(graph(lines), graph(lines), metrics=CHEAP)
     assert table["f1"].to_numpy() == pytest.approx(1.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(street_lines())
+def test_a_graph_against_itself_connects_alike_and_lies_in_place(lines: list[Any]) -> None:
+    drawn = [shapely.LineString(line) for line in lines]
+    assume(shapely.length(shapely.union_all(drawn)) > sum(map(shapely.length, drawn)) - 0.01)  # no road above another
+    connected, beside = junctions(graph(lines), graph(lines)), lateral(graph(lines), graph(lines))
+    assert connected.matched_proposal == connected.proposal == connected.reference
+    assert connected.details["arms_not_found"] == 0
+    assert (beside.f1, beside.details["rms_m"]) == (1.0, 0.0)
 
 
 @settings(max_examples=15, deadline=None)

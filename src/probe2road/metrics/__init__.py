@@ -12,6 +12,8 @@ from probe2road.metrics.evaluate import DEFAULT_METRICS, METRICS, evaluate
 from probe2road.metrics.geo import HE_BALAKRISHNAN_2022, GeoOptions, GeoSamples, geo, geo_samples
 from probe2road.metrics.graph_sampling import GraphSamplingOptions, graph_sampling
 from probe2road.metrics.itopo import ItopoOptions, Pairs, itopo, itopo_pairs
+from probe2road.metrics.junctions import JunctionOptions, JunctionPairs, junction_pairs, junctions
+from probe2road.metrics.lateral import LateralOptions, lateral, lateral_gaps
 from probe2road.metrics.normalise import clip_graph, comparable
 from probe2road.metrics.scores import SCORE_DTYPES, Score, scores_table
 from probe2road.metrics.soft_f1 import soft_f1
@@ -28,6 +30,9 @@ __all__ = [
     "GeoSamples",
     "GraphSamplingOptions",
     "ItopoOptions",
+    "JunctionOptions",
+    "JunctionPairs",
+    "LateralOptions",
     "Pairs",
     "Score",
     "TopoOptions",
@@ -41,6 +46,10 @@ __all__ = [
     "graph_sampling",
     "itopo",
     "itopo_pairs",
+    "junction_pairs",
+    "junctions",
+    "lateral",
+    "lateral_gaps",
     "scores_table",
     "soft_f1",
     "topo",

@@ -12,11 +12,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from probe2road.metrics.matching import require_positive
-from probe2road.metrics.network import EPSILON, Network, locate
+from probe2road.metrics.network import EPSILON, Network, locate, shortest_arcs
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.scores import Score
 from probe2road.roadgraph import RoadGraph
@@ -155,14 +154,6 @@ def _route_lengths(network: Network, edge: NDArray[np.int64], offset: NDArray[np
     order = np.lexsort((kind, along, owner))
     owner, along, stop = owner[order], along[order], stop[order]
     same = owner[1:] == owner[:-1]
-    size = np.maximum(np.diff(along)[same], 1e-12)  # an explicit zero would mean no arc
-    a, b = stop[:-1][same], stop[1:][same]
-    low, high = np.minimum(a, b), np.maximum(a, b)
-    order = np.lexsort((size, high, low))
-    low, high, size = low[order], high[order], size[order]
-    shortest = np.ones(len(low), bool)  # of parallel arcs
-    shortest[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
-    n = n_nodes + len(edge)
-    arcs = csr_array((size[shortest], (low[shortest], high[shortest])), shape=(n, n))
+    arcs = shortest_arcs(stop[:-1][same], stop[1:][same], np.diff(along)[same], n_nodes + len(edge))
     positions = n_nodes + np.arange(len(edge))
     return dijkstra(arcs, directed=False, indices=positions)[:, positions]

@@ -15,6 +15,8 @@ from probe2road.metrics.buffer import BufferGeoOptions, buffer_geo_networks
 from probe2road.metrics.geo import GeoOptions, geo_networks
 from probe2road.metrics.graph_sampling import GraphSamplingOptions, graph_sampling_networks
 from probe2road.metrics.itopo import ItopoOptions, itopo_networks
+from probe2road.metrics.junctions import JunctionOptions, junctions_networks
+from probe2road.metrics.lateral import LateralOptions, lateral_networks
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.scores import Score, scores_table
 from probe2road.metrics.topo import TopoOptions, topo_networks
@@ -24,7 +26,16 @@ __all__ = ["DEFAULT_METRICS", "METRICS", "MetricOptions", "evaluate"]
 
 logger = logging.getLogger(__name__)
 
-MetricOptions = GeoOptions | ItopoOptions | TopoOptions | AplsOptions | BufferGeoOptions | GraphSamplingOptions
+MetricOptions = (
+    GeoOptions
+    | ItopoOptions
+    | TopoOptions
+    | AplsOptions
+    | BufferGeoOptions
+    | GraphSamplingOptions
+    | JunctionOptions
+    | LateralOptions
+)
 
 # The short names of metrics with their default parameters, for the command line and for quick calls.
 METRICS: dict[str, MetricOptions] = {
@@ -35,6 +46,8 @@ METRICS: dict[str, MetricOptions] = {
     "apls": AplsOptions(),
     "buffer_geo": BufferGeoOptions(),
     "graph_sampling": GraphSamplingOptions(),
+    "junctions": JunctionOptions(),
+    "lateral": LateralOptions(),
 }
 DEFAULT_METRICS = ("geo", "itopo", "itopo_strict", "topo", "apls")
 
@@ -45,6 +58,8 @@ _SCORERS: dict[type, Callable[..., Score | list[Score]]] = {
     AplsOptions: apls_networks,
     BufferGeoOptions: buffer_geo_networks,
     GraphSamplingOptions: graph_sampling_networks,
+    JunctionOptions: junctions_networks,
+    LateralOptions: lateral_networks,
 }
 
 

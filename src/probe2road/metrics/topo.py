@@ -10,13 +10,13 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 import numpy as np
-import shapely
 from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.metrics.matching import match_one_to_one, require_positive
-from probe2road.metrics.network import EPSILON, Network, locate
+from probe2road.metrics.network import EPSILON, Network
 from probe2road.metrics.normalise import comparable_networks
+from probe2road.metrics.projection import project_along
 from probe2road.metrics.sampling import Centres, Samples, component_roots, sample_around
 from probe2road.metrics.scores import Score, ratio
 from probe2road.roadgraph import RoadGraph
@@ -88,7 +88,9 @@ def topo(proposal: RoadGraph, reference: RoadGraph, options: TopoOptions | None 
 def topo_networks(proposal: Network, reference: Network, options: TopoOptions) -> Score:
     """Score normalised networks, as `topo`."""
     starts = _starts(reference, options)
-    edge, offset = _partners(starts, proposal, options)
+    edge, offset = project_along(
+        starts.xy, starts.direction, proposal, radius=options.start_radius, max_angle=options.start_angle
+    )
     paired = np.flatnonzero(edge >= 0)
     matched, proposed, wanted = (np.zeros(len(paired), np.int64) for _ in range(3))
     for begin in range(0, len(paired), _BATCH):
@@ -135,28 +137,6 @@ def _starts(reference: Network, options: TopoOptions) -> Samples:
     return Samples(
         np.array([0, kept.sum()]), starts.edge[kept], starts.offset[kept], starts.xy[kept], starts.direction[kept]
     )
-
-
-def _partners(
-    starts: Samples, proposal: Network, options: TopoOptions
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Find the nearest position on the proposal that runs along each start; edge -1 where there is none."""
-    edge, offset = np.full(len(starts.edge), -1, np.int64), np.zeros(len(starts.edge))
-    if len(edge) == 0 or len(proposal.lines) == 0:
-        return edge, offset
-    points = shapely.points(starts.xy)
-    row, candidate = shapely.STRtree(proposal.lines).query(
-        points, predicate="dwithin", distance=options.start_radius + EPSILON
-    )
-    along = shapely.line_locate_point(proposal.lines[candidate], points[row])
-    xy, direction = locate(proposal, candidate, along)
-    aligned = np.abs((direction * starts.direction[row]).sum(axis=1)) >= np.cos(np.radians(options.start_angle)) - 1e-9
-    row, candidate, along, xy = row[aligned], candidate[aligned], along[aligned], xy[aligned]
-    gap = np.round(np.hypot(*(xy - starts.xy[row]).T), 6)
-    order = np.lexsort((candidate, gap, row))
-    kept = order[np.unique(row[order], return_index=True)[1]]
-    edge[row[kept]], offset[row[kept]] = candidate[kept], along[kept]
-    return edge, offset
 
 
 def _matched_marbles(marbles: Samples, holes: Samples, options: TopoOptions) -> NDArray[np.int64]:

@@ -1,0 +1,93 @@
+"""Points of one graph looked up on another: the nearest edge that runs along the same line."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from probe2road.metrics.network import EPSILON, Network, locate
+
+__all__ = ["direction_over", "project_along"]
+
+
+def project_along(
+    xy: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    network: Network,
+    *,
+    radius: float,
+    max_angle: float,
+    span: float = 0.0,
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Find the nearest edge that runs along each point's direction, and where on it the point projects to.
+
+    Each edge within the radius is represented by its position nearest to the point; those that run across the
+    direction there are left out. Among equally near edges the lowest is taken.
+
+    Parameters
+    ----------
+    xy, direction
+        Points and unit directions, shape (S, 2).
+    network
+        Where to look.
+    radius
+        Largest distance, inclusive, metres.
+    max_angle
+        Largest angle between the directions as undirected lines, degrees.
+    span
+        Metres to either side over which the direction of an edge is taken; 0 for the segment alone.
+
+    Returns
+    -------
+    edge, offset
+        Shape (S,): the row of the edge, -1 where there is none, and the distance from its start, metres.
+
+    Examples
+    --------
+    The edge across is nearer, but runs the other way:
+
+    >>> from probe2road.metrics.network import network_from_graph
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> network = network_from_graph(graph_from_lines([[(20, -50), (20, 50)], [(0, 3), (50, 3)]], crs="EPSG:32616"))
+    >>> point, east = np.array([[19.0, 0.0]]), np.array([[1.0, 0.0]])
+    >>> [part.tolist() for part in project_along(point, east, network, radius=6.0, max_angle=30.0)]
+    [[1], [19.0]]
+    """
+    edge, offset = np.full(len(xy), -1, np.int64), np.zeros(len(xy))
+    if len(xy) == 0 or len(network.lines) == 0:
+        return edge, offset
+    points = shapely.points(xy)
+    row, candidate = shapely.STRtree(network.lines).query(points, predicate="dwithin", distance=radius + EPSILON)
+    along = shapely.line_locate_point(network.lines[candidate], points[row])
+    cosine = np.abs((direction_over(network, candidate, along, span) * direction[row]).sum(axis=1))
+    aligned = cosine >= np.cos(np.radians(max_angle)) - 1e-9
+    row, candidate, along = row[aligned], candidate[aligned], along[aligned]
+    gap = np.round(np.hypot(*(locate(network, candidate, along)[0] - xy[row]).T), 6)
+    order = np.lexsort((candidate, gap, row))
+    kept = order[np.unique(row[order], return_index=True)[1]]
+    edge[row[kept]], offset[row[kept]] = candidate[kept], along[kept]
+    return edge, offset
+
+
+def direction_over(
+    network: Network, edge: NDArray[np.int64], offset: NDArray[np.float64], span: float
+) -> NDArray[np.float64]:
+    """Return the unit direction of edges at positions, from ``span`` metres before to as many behind, shape (S, 2).
+
+    Traced lines have steps of a pixel, so that a segment says little about where its road leads. The chord is shorter
+    at the ends of an edge. A span of 0 gives the direction of the segment; a chord that closes has direction 0.
+
+    Examples
+    --------
+    >>> from probe2road.metrics.network import network_from_graph
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> network = network_from_graph(graph_from_lines([[(0, 0), (4, 0), (4, 4)]], crs="EPSG:32616"))
+    >>> place = np.array([0]), np.array([4.0])
+    >>> direction_over(network, *place, 0.0).tolist(), direction_over(network, *place, 2.0).round(3).tolist()
+    ([[1.0, 0.0]], [[0.707, 0.707]])
+    """
+    if span == 0.0:
+        return locate(network, edge, offset)[1]
+    chord = locate(network, edge, offset + span)[0] - locate(network, edge, offset - span)[0]
+    return chord / np.maximum(np.hypot(*chord.T), EPSILON)[:, None]
