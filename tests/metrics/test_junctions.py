@@ -15,6 +15,7 @@ from probe2road.metrics import JunctionOptions, comparable, junction_pairs, junc
 from probe2road.metrics.network import network_from_graph
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.simulate.generate import generate_interchange
 
 CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]
@@ -49,6 +50,22 @@ def test_a_ramp_left_out() -> None:
     road = [[WEST, HERE], [HERE, EAST]]
     ramp = [HERE, (150.0, 80.0)]
     assert counts(graph([WEST, EAST]), graph(*road, ramp)) == (1, 0, 2, 1)
+
+
+def test_one_arm_left_out() -> None:
+    assert counts(graph(*CROSSROADS[:3]), graph(*CROSSROADS)) == (3, 0, 3, 1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "places", "crossings"),
+    [("diamond", 6, 2), ("cloverleaf", 16, 4), ("stack", 16, 24), ("trumpet", 6, 4), ("merge_beside_bridge", 1, 3)],
+)
+def test_bridges_of_interchanges_connect_nothing_but_their_own_roads(kind: str, places: int, crossings: int) -> None:
+    """Ramps part and join one by one, three arms each; what these join is too far round for any bridge."""
+    reference = generate_interchange(kind, rng=np.random.default_rng(1)).reference_graph()
+    score = junctions(reference, reference)
+    assert (score.details["junctions"], score.details["crossings"]) == (places, crossings)
+    assert score.matched_proposal == score.proposal == score.reference == 3 * places + 2 * crossings
 
 
 @pytest.mark.parametrize(("away", "connected"), [(20.0, True), (100.0, False)])
