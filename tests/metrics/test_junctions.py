@@ -57,15 +57,21 @@ def test_one_arm_left_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "places", "crossings"),
-    [("diamond", 6, 2), ("cloverleaf", 16, 4), ("stack", 16, 24), ("trumpet", 6, 4), ("merge_beside_bridge", 1, 3)],
+    ("kind", "of_three", "of_four", "crossings"),
+    [
+        ("diamond", 4, 2, 2),
+        ("cloverleaf", 16, 0, 4),
+        ("stack", 16, 0, 24),
+        ("trumpet", 6, 0, 4),
+        ("merge_beside_bridge", 1, 0, 3),
+    ],
 )
-def test_bridges_of_interchanges_connect_nothing_but_their_own_roads(kind: str, places: int, crossings: int) -> None:
-    """Ramps part and join one by one, three arms each; what these join is too far round for any bridge."""
+def test_no_bridge_of_an_interchange_connects(kind: str, of_three: int, of_four: int, crossings: int) -> None:
+    """Junctions of three and four arms have three and six pairs, a bridge two: the ways by its ramps are too long."""
     reference = generate_interchange(kind, rng=np.random.default_rng(1)).reference_graph()
     score = junctions(reference, reference)
-    assert (score.details["junctions"], score.details["crossings"]) == (places, crossings)
-    assert score.matched_proposal == score.proposal == score.reference == 3 * places + 2 * crossings
+    assert (score.details["junctions"], score.details["crossings"]) == (of_three + of_four, crossings)
+    assert score.matched_proposal == score.proposal == score.reference == 3 * of_three + 6 * of_four + 2 * crossings
 
 
 @pytest.mark.parametrize(("away", "connected"), [(20.0, True), (100.0, False)])
