@@ -1,9 +1,11 @@
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from probe2road.clean import CleanOptions
 from probe2road.errors import InputError, OptionError, OutputError
 from probe2road.export import read_graph
 from probe2road.fleet import Fleet, fleet_from_tables
@@ -136,6 +138,21 @@ def test_a_workspace_of_another_run_is_not_mixed_in(crossing, tmp_path, caplog):
     assert "starting afresh" in caplog.text
     again = build(crossing, BuildOptions(segmenter="density", density=DensityOptions(bandwidth=9.0)))
     assert other.edges.geometry.geom_equals_exact(again.edges.geometry, 1e-6).all()
+
+
+def test_options_behind_the_segmentation_keep_its_probability(crossing, tmp_path, monkeypatch):
+    build(crossing, DENSITY, workspace=tmp_path / "work")
+    monkeypatch.setattr("probe2road.recipe.predict_window", None)  # nothing is predicted again
+    other = replace(DENSITY, thinning="zhang_suen", clean=CleanOptions(dead_end=40.0))
+    graph = build(crossing, other, workspace=tmp_path / "work")
+    monkeypatch.undo()
+    again = build(crossing, other)
+    assert graph.edges.geometry.geom_equals_exact(again.edges.geometry, 1e-6).all()
+
+
+def test_an_unknown_thinning_is_refused():
+    with pytest.raises(OptionError, match="there is no thinning 'medial'"):
+        BuildOptions(thinning="medial")
 
 
 def test_a_folder_with_other_things_in_it_is_left_alone(crossing, tmp_path):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from probe2road.segmentation.network import NetworkOptions, find_weights, networ
 from probe2road.segmentation.segmenter import Segmenter
 from probe2road.segmentation.tiling import add_window, predict_window
 from probe2road.segmentation.weights import Weights
-from probe2road.skeleton import skeletonize_windows
+from probe2road.skeleton import METHODS, Method, skeletonize_windows
 from probe2road.vectorize import VectorizeOptions, vectorize
 from probe2road.workspace import Progress, Workspace, open_workspace, silent
 
@@ -44,6 +45,7 @@ class BuildOptions:
     gaps: TraceGaps = field(default_factory=TraceGaps)  # where traces are broken
     network: NetworkOptions = field(default_factory=NetworkOptions)  # of the learned segmenter
     density: DensityOptions = field(default_factory=DensityOptions)  # of the density segmenter
+    thinning: str = "guo_hall"  # how the mask becomes lines of one pixel; or zhang_suen
     vectorize: VectorizeOptions = field(default_factory=VectorizeOptions)  # how pixels become lines
     clean: CleanOptions = field(default_factory=CleanOptions)  # what counts as a flaw
     refine: bool = True  # whether the traces fill gaps, split false junctions and are counted
@@ -53,6 +55,15 @@ class BuildOptions:
         """Refuse an unknown segmenter."""
         if self.segmenter not in SEGMENTERS:
             raise OptionError(f"there is no segmenter {self.segmenter!r}", fix=f"use {', '.join(SEGMENTERS)}")
+        if self.thinning not in METHODS:
+            raise OptionError(f"there is no thinning {self.thinning!r}", fix=f"use {' or '.join(METHODS)}")
+
+    @property
+    def segmentation(self) -> BuildOptions:
+        """Return the options with all that is settled after the segmentation at its default."""
+        network = replace(self.network, threshold=None, seed_threshold=None)
+        chosen = {name: getattr(self, name) for name in ("resolution", "segmenter", "gaps", "density")}
+        return BuildOptions(network=network, **chosen)
 
 
 def build(
@@ -77,8 +88,8 @@ def build(
         The defaults where it is None.
     workspace
         Folder for what every stage makes (GeoTIFF and GeoPackage). A run on the same fleet with the same
-        options takes from it what an earlier run completed, down to single windows. Nothing is written where
-        it is None.
+        options takes from it what an earlier run completed, down to single windows; one with other options behind
+        the segmentation takes the probability. Nothing is written where it is None.
     progress
         Called as the work goes on.
 
@@ -109,7 +120,8 @@ def build(
     grid = fleet_grid(fleet, resolution=options.resolution)
     learned = options.segmenter == "network" or (options.segmenter == "auto" and len(fleet.points) > 0)
     weights = find_weights(fleet, options.network) if learned else None
-    work = open_workspace(workspace, fleet, options, weights=weights.digest if weights else None)
+    digest = weights.digest if weights else None
+    work = open_workspace(workspace, fleet, options, weights=digest, first=options.segmentation)
     if (graph := work.read_graph("7-roads")) is not None:
         return graph
 
@@ -118,7 +130,7 @@ def build(
     mask = threshold_mask(probability, threshold=segmenter.threshold, seed_threshold=segmenter.seed_threshold)
     work.write_raster("2-mask", mask, grid)
     report("skeleton", 0, 1)
-    skeleton = skeletonize_windows(mask)
+    skeleton = skeletonize_windows(mask, method=cast(Method, options.thinning))
     work.write_raster("3-skeleton", skeleton, grid)
     report("graph", 0, 1)
     graph = vectorize(skeleton, grid, probability=probability, options=options.vectorize)

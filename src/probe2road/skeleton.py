@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import logging
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numba import njit
@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 from probe2road.errors import InputError, OptionError
 from probe2road.grid import sparse_zeros
 
-__all__ = ["FIXED", "SET", "skeleton_pixels", "skeletonize", "skeletonize_windows", "thin_state"]
+__all__ = ["FIXED", "METHODS", "SET", "Method", "skeleton_pixels", "skeletonize", "skeletonize_windows", "thin_state"]
 
 logger = logging.getLogger(__name__)
 
 Method = Literal["guo_hall", "zhang_suen"]
+METHODS: tuple[Method, ...] = get_args(Method)
 
 _NO_LIMIT = 2**62  # iterations
 # Bits of a pixel's state. What is fixed is set, too.

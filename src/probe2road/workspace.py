@@ -2,7 +2,8 @@
 
 A workspace is a folder with one file per stage and the fingerprint of the fleet, options and weights that made them.
 Files are written atomically, so whatever is there is complete. A folder with another fingerprint is emptied
-of its stage files first: stages of two runs never mix.
+of its stage files first: stages of two runs never mix. What the first stage made, which is most of the work, stays
+where only options of later stages changed.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ def silent(stage: str, done: int, total: int) -> None:
 
 
 _MARK = "run.json"
-_FORMAT = 2  # raised when what a stage writes changes
+_FIRST = ("1-", "window-")  # how the files of the first stage begin
+_FORMAT = 3  # raised when what a stage writes changes
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,12 @@ class Workspace:
 
 
 def open_workspace(
-    folder: str | Path | None, fleet: Fleet, options: DataclassInstance, *, weights: str | None = None
+    folder: str | Path | None,
+    fleet: Fleet,
+    options: DataclassInstance,
+    *,
+    weights: str | None = None,
+    first: DataclassInstance | None = None,
 ) -> Workspace:
     """Open the workspace of a run, empty unless it belongs to the same fleet, options and weights.
 
@@ -125,6 +132,9 @@ def open_workspace(
         What the run works on.
     weights
         Digest of the network's weights, if the run uses one.
+    first
+        The options that the first stage depends on. Its files stay where these, the fleet and the weights are the same.
+        Without them all options count for all files.
 
     Raises
     ------
@@ -134,7 +144,9 @@ def open_workspace(
     if folder is None:
         return Workspace(None)
     folder = Path(folder)
-    mark = {"format": _FORMAT, "fleet": fingerprint(fleet), "options": asdict(options), "weights": weights}
+    mark = {"format": _FORMAT, "fleet": fingerprint(fleet), "weights": weights}
+    mark |= {"options": asdict(options), "first": asdict(first or options)}
+    mark = json.loads(json.dumps(mark))  # tuples become lists, as they are in a file
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -142,10 +154,11 @@ def open_workspace(
     path = folder / _MARK
     if not path.exists() and any(folder.iterdir()):
         raise OutputError("the folder is not empty and not a workspace", where=folder, fix="name an empty folder")
-    if path.exists() and json.loads(path.read_text()) != mark:
-        logger.info("%s belongs to another run: starting afresh", folder)
+    if path.exists() and (kept := json.loads(path.read_text())) != mark:
+        stays = _FIRST if all(kept.get(name) == mark[name] for name in mark if name != "options") else ()
+        logger.info("%s belongs to another run: %s", folder, "keeping its first stage" if stays else "starting afresh")
         for file in folder.iterdir():
-            if file.suffix in (".tif", ".gpkg", ".npz", ".npy", ".json", ".png"):
+            if file.suffix in (".tif", ".gpkg", ".npz", ".npy", ".json", ".png") and not file.name.startswith(stays):
                 file.unlink()
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(mark, indent=1))
