@@ -393,6 +393,36 @@ def prepare(
             typer.echo(folder)
 
 
+@_benchmark.command()
+def run(
+    sets: Annotated[Path, typer.Argument(help="Folder of prepared data sets.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for tables, cells and pictures.")],
+    names: Annotated[list[str] | None, typer.Option("--name", help="Data set; may be repeated.")] = None,
+    methods: Annotated[list[str] | None, typer.Option("--method", help="Method; may be repeated.")] = None,
+    work: Annotated[Path | None, typer.Option(help="Folder that keeps graphs and scores.")] = None,
+    poses: Annotated[str, typer.Option(help="aligned (by align), modelled (as after an alignment), raw.")] = "aligned",
+    deepmg: Annotated[Path | None, typer.Option(help="Weights of DeepMG; left out without them.")] = None,
+) -> None:
+    """Build and score every method on every data set, and write the paper's tables.
+
+    An interrupted run goes on where it stopped when it is started again.
+    """
+    from probe2road.comparison.run import CITIES, run_benchmark
+
+    with _progress_bar() as progress:
+        run_benchmark(
+            sets,
+            output,
+            names=names or CITIES,
+            methods=methods or (),
+            work=work,
+            poses=poses,
+            deepmg=deepmg,
+            progress=progress,
+        )
+    typer.echo(output / "index.md")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; an error of ours is one message and exit code 2."""
     # How much to say is said to the program, but may stand anywhere.

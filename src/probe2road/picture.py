@@ -51,12 +51,15 @@ class Stage:
         Where an array lies; None for a graph.
     caption
         A line of numbers under the title; of a graph it is made here where it is empty.
+    reference
+        Graph to draw underneath as a broad pale band.
     """
 
     title: str
     content: RoadGraph | NDArray[Any]
     grid: Grid | None = None
     caption: str = ""
+    reference: RoadGraph | None = None
 
 
 def write_filmstrip(
@@ -103,6 +106,8 @@ def write_filmstrip(
     for axis in axes[len(stages) :]:
         axis.set_axis_off()
     for axis, stage in zip(axes, stages, strict=False):
+        if stage.reference is not None:
+            _draw_lines(axis, stage.reference.edges.geometry.to_numpy(), _REFERENCE_COLOR, 4.0, level=0)
         if isinstance(stage.content, RoadGraph):
             _draw_edges(axis, stage.content)
             caption = stage.caption or f"{len(stage.content.edges):,} edges, {stage.content.length / 1000:,.1f} km"

@@ -1,0 +1,171 @@
+"""The fleet data of a comparison: a prepared data set, with the poses and as many drives as are asked for."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import shutil
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import shapely
+from numpy.typing import NDArray
+
+from probe2road.benchmark.datasets import find_dataset
+from probe2road.benchmark.prepare import check_dataset, read_tiles
+from probe2road.benchmark.recording import Recording
+from probe2road.benchmark.reference import labelled_reference
+from probe2road.benchmark.tiles import SPLITS, split_area
+from probe2road.errors import InputError, OptionError
+from probe2road.export import read_graph
+from probe2road.fleet import Fleet
+from probe2road.io.fleet_reader import read_fleet_files
+from probe2road.io.fleet_writer import write_fleet
+from probe2road.roadgraph import RoadGraph
+
+__all__ = ["POSES", "Source", "choose_drives", "make_fleet"]
+
+logger = logging.getLogger(__name__)
+
+# Poses that a fleet may have: from `probe2road align`, from the model of what an alignment leaves, or as recorded.
+POSES = ("aligned", "modelled", "raw")
+
+_SEED = 64
+
+
+@dataclass(frozen=True)
+class Source:
+    """A prepared data set, which of its fleets is taken, and where the work on it is kept."""
+
+    folder: Path
+    work: Path
+    poses: str = "aligned"  # one of POSES
+    drives: int | None = None  # of each road at most, roughly; all where None
+
+    def __post_init__(self) -> None:
+        """Refuse unknown poses."""
+        if self.poses not in POSES:
+            raise OptionError(f"there are no poses {self.poses!r}", where="benchmark", fix=f"use {', '.join(POSES)}")
+
+    @property
+    def name(self) -> str:
+        """Of the data set."""
+        return self.folder.name
+
+    @property
+    def place(self) -> Path:
+        """Folder of all that is made from this fleet."""
+        return self.work / (f"{self.name}-{self.poses}" + ("" if self.drives is None else f"-{self.drives}"))
+
+    @cached_property
+    def digest(self) -> str:
+        """Of the whole data set: its manifest holds the checksums of all files."""
+        check_dataset(self.folder)
+        return hashlib.sha256((self.folder / "manifest.json").read_bytes()).hexdigest()[:16]
+
+    @cached_property
+    def driven(self) -> RoadGraph:
+        """The true road graph with the true number of drives."""
+        return read_graph(Recording(self.folder).reference)
+
+    @cached_property
+    def reference(self) -> RoadGraph:
+        """The roads that at least four drives of the whole fleet passed."""
+        return labelled_reference(self.driven)
+
+    @cached_property
+    def areas(self) -> dict[str, shapely.Geometry | None]:
+        """Name and extent of what is scored: the splits, or the whole."""
+        if not find_dataset(self.name).splits:
+            return {self.name: None}
+        tiles = read_tiles(self.folder)
+        return {f"{self.name}, {split}": split_area(tiles, split) for split in SPLITS}
+
+    @property
+    def fleet_file(self) -> Path:
+        """Traces of the fleet; `make_fleet` makes what the data set does not have."""
+        if self.drives is None and self.poses == "raw":
+            return Recording(self.folder).drives
+        if self.drives is None and self.poses == "modelled":
+            return Recording(self.folder).aligned
+        return self.place / "fleet.parquet"
+
+
+def make_fleet(source: Source) -> None:
+    """Align the raw fleet, or choose drives of a fleet, where the files are missing.
+
+    Raises
+    ------
+    InputError
+        If the data set has no such fleet.
+    MissingExtraError
+        If an alignment is needed and GTSAM is not installed.
+    """
+    path = source.fleet_file
+    if path.exists():
+        return
+    if source.drives is None and source.poses != "aligned":
+        raise InputError("the data set has no such fleet", where=path, fix="prepare it again, or choose other poses")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if source.drives is not None:
+        whole = replace(source, drives=None)
+        make_fleet(whole)
+        routes = pq.read_table(Recording(source.folder).routes).to_pandas()
+        chosen = choose_drives(routes, source.drives, rng=np.random.default_rng(_SEED))
+        write_fleet(_of_drives(read_fleet_files(whole.fleet_file), chosen), path)
+        return
+    from probe2road.align import align  # needs the extra
+
+    logger.info("aligning the raw fleet of %s", source.name)
+    workspace = path.parent / "alignment"
+    aligned = align(read_fleet_files(Recording(source.folder).drives), workspace=workspace)
+    write_fleet(aligned.fleet, path)
+    shutil.rmtree(workspace, ignore_errors=True)
+
+
+def choose_drives(routes: pd.DataFrame, most: int, *, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Choose drives so that a road has about as many as asked for, wherever the fleet has them.
+
+    Drives are taken in random order, each one that passes a road which has not got enough yet. A road on the way of
+    many others ends up with more.
+
+    Parameters
+    ----------
+    routes
+        Columns ``trace_id`` and ``section``.
+    most
+        Drives of a road.
+    rng
+        Draws the order.
+
+    Returns
+    -------
+    ndarray of int64
+        Their ids, sorted.
+
+    Examples
+    --------
+    >>> routes = pd.DataFrame({"trace_id": [0, 0, 1, 2, 2], "section": [5, 6, 5, 5, 6]})
+    >>> len(choose_drives(routes, 1, rng=np.random.default_rng(0))) < 3
+    True
+    """
+    sections, place = np.unique(routes["section"].to_numpy(), return_inverse=True)
+    passed = {drive: np.unique(place[rows]) for drive, rows in routes.groupby("trace_id").indices.items()}
+    drives = np.array(sorted(passed), np.int64)
+    count = np.zeros(len(sections), np.int64)
+    chosen = []
+    for drive in rng.permutation(drives):
+        if (count[passed[drive]] < most).any():
+            count[passed[drive]] += 1
+            chosen.append(drive)
+    return np.sort(np.array(chosen, np.int64))
+
+
+def _of_drives(fleet: Fleet, drives: NDArray[np.int64]) -> Fleet:
+    """Keep some of the drives."""
+    kept = [table[table["trace_id"].isin(drives)].reset_index(drop=True) for table in (fleet.traces, fleet.points)]
+    return Fleet(kept[0], kept[1], fleet.crs)

@@ -1,0 +1,127 @@
+"""The tables of the paper in Markdown: our cells, their intervals, and the paper's numbers beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from probe2road.comparison.cells import FULL, Cell
+from probe2road.comparison.intervals import Interval, difference_interval, f1_interval
+from probe2road.comparison.methods import METHODS
+from probe2road.comparison.published import METHODS_TABLE, SOFT_F1_TABLE, STAGES_TABLE, VISION_TABLE, Triple
+from probe2road.metrics.scores import f_score, ratio
+
+__all__ = ["cost_table", "difference_table", "methods_table", "soft_table", "stages_table", "vision_table"]
+
+_GRAPH_METRICS = ("geo", "itopo")
+_OURS = "probe2road"
+_PAIR_HEADER = ["GEO P", "R", "F1", "iTOPO P", "R", "F1", "paper: GEO F1", "iTOPO F1"]
+
+
+def methods_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
+    """Write Tables I and II: GEO and iTOPO of every method in some areas."""
+    rows = []
+    for area in areas:
+        for cell in _full(cells, area):
+            paper = METHODS_TABLE.get((area, cell.method))
+            rows.append([area, METHODS[cell.method].label, *_pair(cell), *_paper_pair(paper)])
+    return _markdown(["area", "method", *_PAIR_HEADER], rows)
+
+
+def soft_table(cells: Sequence[Cell]) -> str:
+    """Write Table III: soft F1 of the masks of our own methods."""
+    rows = []
+    for cell in cells:
+        if cell.stage != FULL or "soft_f1" not in cell.tiles:
+            continue
+        paper = SOFT_F1_TABLE.get(cell.area) if cell.method == _OURS else None
+        triples = [*_triple(cell, "soft_f1"), *_triple(cell, "soft_f1_thinned")]
+        rows.append([cell.area, METHODS[cell.method].label, *triples, "" if paper is None else f"{paper.f1:.3f}"])
+    header = ["area", "method", "mask P", "R", "soft F1", "skeleton P", "R", "soft F1", "paper"]
+    return _markdown(header, rows)
+
+
+def vision_table(cells: Sequence[Cell], area: str) -> str:
+    """Write Table IV: the same network with and without the points of the camera."""
+    chosen = {cell.method: cell for cell in _full(cells, area)}
+    rows = [
+        [area, METHODS[name].label, *_pair(chosen[name]), *_paper_pair(paper if area == "boston" else None)]
+        for name, paper in VISION_TABLE.items()
+        if name in chosen
+    ]
+    return _markdown(["area", "method", *_PAIR_HEADER], rows)
+
+
+def stages_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
+    """Write Table V: what each step of the post-processing gives."""
+    rows = []
+    for area in areas:
+        for cell in (cell for cell in cells if cell.area == area and cell.method == _OURS):
+            paper = STAGES_TABLE.get(cell.stage) if area == "boston" else None
+            rows.append([area, cell.stage, *_pair(cell, digits=4), *_paper_pair(paper, digits=4)])
+    return _markdown(["area", "stage", *_PAIR_HEADER], rows)
+
+
+def difference_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
+    """Write by how much Probe2Road is ahead of each other method, tiles drawn for both alike."""
+    rows = []
+    for area in areas:
+        chosen = {cell.method: cell for cell in _full(cells, area)}
+        if _OURS not in chosen:
+            continue
+        for name in (name for name in chosen if name != _OURS):
+            pairs = [(chosen[_OURS].tiles[metric], chosen[name].tiles[metric]) for metric in _GRAPH_METRICS]
+            ahead = [_with_interval(difference_interval(*pair), sign="+") for pair in pairs]
+            rows.append([area, METHODS[name].label, *ahead])
+    return _markdown(["area", "Probe2Road ahead of", "GEO F1", "iTOPO F1"], rows)
+
+
+def cost_table(cells: Sequence[Cell]) -> str:
+    """Write what stands beside the paper's metrics: other metrics, size, and what a build costs."""
+    names = ("topo_f1", "apls_f1", "junctions_f1")
+    rows = []
+    for cell in (cell for cell in cells if cell.stage == FULL):
+        figures = cell.figures
+        rows.append(
+            [
+                cell.area, METHODS[cell.method].label, *(f"{figures[name]:.3f}" for name in names),
+                f"{figures['median_m']:.2f}", f"{figures['p95_m']:.2f}", f"{figures['nodes']:.0f}",
+                f"{figures['km']:.1f}", f"{figures['seconds']:.0f}{'+' if figures['resumed'] else ''}",
+                f"{figures['megabytes']:.0f}",
+            ]
+        )  # fmt: skip
+    header = ["area", "method", "TOPO F1", "APLS", "junctions F1", "lateral, m", "95 %, m", "nodes", "km", "s", "MB"]
+    return _markdown(header, rows)
+
+
+def _full(cells: Sequence[Cell], area: str) -> list[Cell]:
+    """Finished graphs in an area."""
+    return [cell for cell in cells if cell.area == area and cell.stage == FULL]
+
+
+def _pair(cell: Cell, *, digits: int = 3) -> list[str]:
+    """GEO and iTOPO of a cell."""
+    return [text for metric in _GRAPH_METRICS for text in _triple(cell, metric, digits=digits)]
+
+
+def _triple(cell: Cell, metric: str, *, digits: int = 3) -> list[str]:
+    """Precision, recall and F1 with its interval."""
+    sums = cell.tiles[metric].sum()
+    precision = ratio(sums["matched_proposal"], sums["proposal"])
+    recall = ratio(sums["matched_reference"], sums["reference"])
+    interval = f1_interval(cell.tiles[metric])
+    f1 = Interval(f_score(precision, recall), interval.low, interval.high)
+    return [f"{precision:.{digits}f}", f"{recall:.{digits}f}", _with_interval(f1, digits=digits)]
+
+
+def _with_interval(interval: Interval, *, sign: str = "", digits: int = 3) -> str:
+    return f"{interval.value:{sign}.{digits}f} ({interval.low:{sign}.3f} to {interval.high:{sign}.3f})"
+
+
+def _paper_pair(paper: tuple[Triple, Triple] | None, *, digits: int = 3) -> list[str]:
+    """F1 of GEO and iTOPO as the paper has them."""
+    return ["", ""] if paper is None else [f"{triple.f1:.{digits}f}" for triple in paper]
+
+
+def _markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
