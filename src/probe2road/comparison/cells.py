@@ -58,7 +58,7 @@ class Cell:
     stage: str
     poses: str
     tiles: Mapping[str, pd.DataFrame]  # of geo, itopo, and of soft_f1 and soft_f1_thinned where there is a mask
-    figures: Mapping[str, float]  # all else: scores without intervals, size, cost
+    figures: Mapping[str, float | None]  # all else: scores without intervals, size, cost; None is not defined
     key: Mapping[str, Any]  # what made it
 
     def as_row(self) -> dict[str, Any]:
@@ -112,7 +112,7 @@ def score_cells(source: Source, method: Method) -> list[Cell]:
 
 def score_graph(
     graph: RoadGraph, reference: RoadGraph, *, area: shapely.Geometry | None = None
-) -> tuple[dict[str, pd.DataFrame], dict[str, float]]:
+) -> tuple[dict[str, pd.DataFrame], dict[str, float | None]]:
     """Score a graph in all metrics of the tables.
 
     Returns
@@ -125,7 +125,7 @@ def score_graph(
     graph = replace(graph, turns=graph.turns.iloc[:0])
     networks = comparable_networks(graph, reference, area=area)
     tiles = {"geo": geo_counts(*networks), "itopo": itopo_counts(*networks)}
-    figures: dict[str, float] = {}
+    figures: dict[str, float | None] = {}
     for row in evaluate(graph, reference, metrics=_METRICS, area=area).itertuples():
         figures |= {f"{row.metric}_{what}": getattr(row, what) for what in ("precision", "recall", "f1")}
         details = json.loads(row.details)

@@ -84,7 +84,8 @@ def cost_table(cells: Sequence[Cell]) -> str:
         rows.append(
             [
                 cell.area, METHODS[cell.method].label, *(f"{figures[name]:.3f}" for name in names),
-                f"{figures['median_m']:.2f}", f"{figures['p95_m']:.2f}", f"{figures['nodes']:.0f}",
+                *("" if figures[name] is None else f"{figures[name]:.2f}" for name in ("median_m", "p95_m")),
+                f"{figures['nodes']:.0f}",
                 f"{figures['km']:.1f}", f"{figures['seconds']:.0f}{'+' if figures['resumed'] else ''}",
                 f"{figures['megabytes']:.0f}",
             ]
