@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator
 
 import pytest
 from hypothesis import settings
@@ -17,10 +16,9 @@ if os.environ.get("CI"):
 
 
 @pytest.fixture(autouse=True)
-def same_log() -> Iterator[None]:
-    """Undo what the command line does to the log, so that the next test can look into it."""
+def untouched_log() -> None:
+    """Undo what the command line did to the log in an earlier test or fixture."""
     logger = logging.getLogger("probe2road")
-    before = logger.handlers[:], logger.level, logger.propagate
-    yield
-    logger.handlers[:], logger.propagate = before[0], before[2]
-    logger.setLevel(before[1])
+    logger.handlers.clear()
+    logger.setLevel(logging.NOTSET)
+    logger.propagate = True
