@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from probe2road.alignment.floors import Floors, find_floors, floor_of, registered_heights
 from probe2road.alignment.graph import optimise
 from probe2road.alignment.heights import solve_heights
+from probe2road.alignment.hypotheses import Track
 from probe2road.alignment.keyframes import Keyframes, Sightings, keyframes, sightings, wrapped
 from probe2road.alignment.lines import Condensed, Matches, condense, match_lines
 from probe2road.alignment.options import AlignOptions
-from probe2road.alignment.registration import Evidence, ShiftSearch, register
+from probe2road.alignment.profiles import ShiftSearch
+from probe2road.alignment.registration import Chains, Evidence, register
 from probe2road.alignment.spines import CELL, OnSpines, Spines, find_spines, project
 from probe2road.fleet import Fleet
 
@@ -72,7 +74,7 @@ class _Scene:
     frames: Keyframes
     seen: Sightings
     held: NDArray[np.bool_]  # (k,) keyframes that stay
-    order: NDArray[np.int64]  # chains, best first
+    chains: Chains  # best first
     options: AlignOptions
 
 
@@ -94,12 +96,12 @@ def align_area(fleet: Fleet, options: AlignOptions, *, held: NDArray[np.bool_] |
     """
     frames = keyframes(fleet, options)
     held = np.zeros(fleet.n_traces, bool) if held is None else held
-    scene = _Scene(frames, sightings(fleet, frames), held[frames.drive], _best_first(frames), options)
+    scene = _Scene(frames, sightings(fleet, frames), held[frames.drive], _chains(frames, held), options)
     pose = optimise(frames, frames.pose, _nothing(), np.zeros((0, 3)), options, held=scene.held)
-    # Drives that were too far off to be found the first time are nearer the second time.
-    for gates in (options.gates[:_TRIAL_ROUNDS], options.gates):
-        spines = find_spines(replace(frames, pose=pose), _held_first(scene), options)
-        pose, floors, height = _register(scene, pose, spines)
+    # Drives that were too far off to be found the first time are nearer the second time, on a map of all the others.
+    for settled, gates in ((False, options.gates[:_TRIAL_ROUNDS]), (True, options.gates)):
+        spines = find_spines(replace(frames, pose=pose), scene.chains.placing, options)
+        pose, floors, height = _register(scene, pose, spines, settled=settled)
         pose, matches, rounds = _iterate(scene, pose, spines, floors, height, gates)
     on = project(spines, pose, options)
     floor = floor_of(floors, on.cell, height, options)
@@ -125,16 +127,12 @@ def _iterate(
     return pose, matches, rounds
 
 
-def _best_first(frames: Keyframes) -> NDArray[np.int64]:
+def _chains(frames: Keyframes, held: NDArray[np.bool_]) -> Chains:
     """Chains by what they believe of their accuracy, and by length."""
     starts = frames.starts
     n = np.diff(starts)
-    return np.lexsort((-n, np.round(np.add.reduceat(frames.sigma, starts[:-1]) / n, 1)))
-
-
-def _held_first(scene: _Scene) -> NDArray[np.int64]:
-    held = scene.held[scene.frames.starts[:-1]]
-    return np.concatenate([scene.order[held[scene.order]], scene.order[~held[scene.order]]])
+    order = np.lexsort((-n, np.round(np.add.reduceat(frames.sigma, starts[:-1]) / n, 1)))
+    return Chains(starts, order, held[frames.drive[starts[:-1]]])
 
 
 def _nothing() -> Condensed:
@@ -152,13 +150,12 @@ def _points_on_spines(scene: _Scene, pose: NDArray[np.float64], spines: Spines) 
 
 
 def _register(
-    scene: _Scene, pose: NDArray[np.float64], spines: Spines
+    scene: _Scene, pose: NDArray[np.float64], spines: Spines, *, settled: bool
 ) -> tuple[NDArray[np.float64], Floors, NDArray[np.float64]]:
     """Bring drives onto one another, first in height, then across the road: poses, floors, heights over the spines."""
     frames, options = scene.frames, scene.options
-    chain_held = scene.held[frames.starts[:-1]]
     on = project(spines, pose, options)
-    height = registered_heights(frames, on, spines, scene.order, options, chain_held)
+    height = registered_heights(frames, on, spines, scene.chains, options)
     floors = find_floors(on, height, spines, options)
     home = floor_of(floors, on.cell, height, options)
     if len(scene.seen.keyframe) == 0 or len(floors.cell) == 0:
@@ -168,14 +165,15 @@ def _register(
     found = floor >= 0
     seen = Evidence(scene.seen.keyframe[found], floor[found], points.left[found], scene.seen.kind[found])
     angle = spines.station[np.maximum(on.station, 0), 2]
-    shift = register(
-        seen, floors.places, frames.starts, scene.order, home, on.left,
-        np.cos(angle) * (frames.pose[:, 1] - pose[:, 1]) - np.sin(angle) * (frames.pose[:, 0] - pose[:, 0]),
-        np.maximum(frames.motion_sigma[:, 1], _LEAST_MOVE), np.sqrt(2.0) * frames.sigma * frames.inflation(options),
-        ShiftSearch(
-            options.search, _SEARCH_BIN, options.search + 20.0, _SEARCH_KERNEL, _SEARCH_DOUBT, _SEARCH_TEMPER
-        ), held=chain_held,
+    recorded = np.cos(angle) * (frames.pose[:, 1] - pose[:, 1]) - np.sin(angle) * (frames.pose[:, 0] - pose[:, 0])
+    track = Track(
+        home, on.left, recorded, np.maximum(frames.motion_sigma[:, 1], _LEAST_MOVE),
+        np.sqrt(2.0) * frames.sigma * frames.inflation(options),
     )  # fmt: skip
+    search = ShiftSearch(
+        options.search, _SEARCH_BIN, options.search + 20.0, _SEARCH_KERNEL, _SEARCH_DOUBT, _SEARCH_TEMPER
+    )
+    shift = register(seen, floors.places, scene.chains, track, search, settled=settled)
     moved = pose.copy()
     moved[:, 0] -= np.where(home >= 0, shift * np.sin(angle), 0.0)
     moved[:, 1] += np.where(home >= 0, shift * np.cos(angle), 0.0)

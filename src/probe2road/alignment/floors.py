@@ -16,9 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from probe2road.alignment.hypotheses import Track
 from probe2road.alignment.keyframes import Keyframes
 from probe2road.alignment.options import AlignOptions
-from probe2road.alignment.registration import Evidence, Places, ShiftSearch, register
+from probe2road.alignment.profiles import Places, ShiftSearch
+from probe2road.alignment.registration import Chains, Evidence, register
 from probe2road.alignment.spines import OnSpines, Spines
 
 __all__ = ["VERTICAL", "Floors", "find_floors", "floor_of", "registered_heights"]
@@ -48,9 +50,8 @@ def registered_heights(
     frames: Keyframes,
     on: OnSpines,
     spines: Spines,
-    order: NDArray[np.int64],
+    chains: Chains,
     options: AlignOptions,
-    held: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
     """Height of every keyframe above its spine, m, drives brought together; NaN where it is not known.
 
@@ -63,15 +64,13 @@ def registered_heights(
     kind = np.zeros(len(known), np.int8)
     persuasion = _PERSUASION * options.keyframe_spacing / options.gnss_length
     length = np.diff(frames.distance, prepend=frames.distance[:1])
-    shift = register(
-        Evidence(known, on.cell[known], raw[known], kind),
-        Places.from_roads(spines.cell_spine), frames.starts, order, on.cell, np.nan_to_num(raw),
-        np.zeros(len(raw)),
-        np.maximum(options.height_share * length, 0.1),
+    track = Track(
+        on.cell, np.nan_to_num(raw), np.zeros(len(raw)), np.maximum(options.height_share * length, 0.1),
         VERTICAL * frames.sigma * frames.inflation(options),
-        ShiftSearch(options.height_search, 0.5, 3.0 * options.height_search, 0.7, 0.7, persuasion, novelty=0.0),
-        held=held,
     )  # fmt: skip
+    search = ShiftSearch(options.height_search, 0.5, 3.0 * options.height_search, 0.7, 0.7, persuasion, novelty=0.0)
+    seen = Evidence(known, on.cell[known], raw[known], kind)
+    shift = register(seen, Places.from_roads(spines.cell_spine), chains, track, search)
     return raw + shift
 
 

@@ -1,0 +1,46 @@
+"""Registration, on lines across a road of ten places."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from probe2road.alignment.hypotheses import Track
+from probe2road.alignment.profiles import Places, ShiftSearch
+from probe2road.alignment.registration import Chains, Evidence, register
+
+PLACES = Places.from_roads(np.zeros(10, np.int64))
+SEARCH = ShiftSearch(6.0, 0.25, 20.0, 0.3, 0.7, 0.5)
+LINES = np.array([-5.6, -1.8, 1.8])  # m; not alike under any shift of a lane
+
+
+def shifts(off: list[float], *, settled: bool = False, held: list[bool] | None = None) -> list[float]:
+    """Median shift of drives that see the lines, each so many metres off."""
+    n = len(off)
+    keyframe = np.repeat(np.arange(10 * n), len(LINES))
+    value = np.tile(LINES, 10 * n) + np.repeat(off, 10 * len(LINES))
+    seen = Evidence(keyframe, keyframe % 10, value, np.zeros(len(keyframe), np.int8))
+    chains = Chains(10 * np.arange(n + 1), np.arange(n), np.array(held or [False] * n))
+    track = Track(
+        np.arange(10 * n) % 10, np.repeat(off, 10), np.zeros(10 * n), np.full(10 * n, 0.1), np.full(10 * n, 20.0)
+    )
+    return np.median(register(seen, PLACES, chains, track, SEARCH, settled=settled).reshape(n, 10), axis=1).tolist()
+
+
+def test_the_first_drive_decides_where_no_other_says_more() -> None:
+    assert shifts([0.0, 3.5, -2.0]) == pytest.approx([0.0, -3.5, 2.0], abs=0.3)
+
+
+def test_settled_drives_stay() -> None:
+    assert shifts([1.0] * 4, settled=True) == [0.0] * 4
+
+
+def test_among_settled_drives_the_first_follows_the_others_too() -> None:
+    assert shifts([3.5, 0.0, 0.0, 0.0, 0.0], settled=True) == pytest.approx([-3.5, 0.0, 0.0, 0.0, 0.0], abs=0.3)
+
+
+@pytest.mark.parametrize("settled", [False, True])
+def test_held_drives_stay_and_the_others_come_to_them(settled: bool) -> None:
+    assert shifts([0.0, 0.0, 3.5], settled=settled, held=[False, False, True]) == pytest.approx(
+        [3.5, 3.5, 0.0], abs=0.3
+    )
