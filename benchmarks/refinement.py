@@ -21,6 +21,7 @@ from probe2road.disambiguate import DisambiguateOptions, split_false_junctions
 from probe2road.evidence import add_evidence
 from probe2road.export import read_graph
 from probe2road.fleet import Fleet
+from probe2road.forks import move_forks
 from probe2road.gaps import drop_undriven, fill_gaps, gap_weights, prune_gaps
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.mapmatch import match
@@ -95,11 +96,16 @@ def rows(fleet: Fleet, segmenter: str) -> list[Row]:
     positions = passing_positions(fleet, matches, graph)
     split = split_false_junctions(graph, matches.steps, positions=positions)
     note("guarded, with heights", split)
-    matches = match(fleet, split)
+    graph, matches = split, match(fleet, split)
     if segmenter == "network":
-        note("undriven edges dropped", clean_graph(drop_undriven(split, matches.steps)))
-        return done
-    note("centrelines moved", refine_centreline(add_evidence(split, fleet, matches), fleet, matches))
+        graph = clean_graph(drop_undriven(graph, matches.steps))
+        matches = match(fleet, graph)
+        note("undriven edges dropped", graph)
+    graph = move_forks(graph, fleet, matches)
+    note("forks moved", graph)
+    if segmenter == "density":
+        matches = match(fleet, graph)
+        note("centrelines moved", refine_centreline(add_evidence(graph, fleet, matches), fleet, matches))
     return done
 
 

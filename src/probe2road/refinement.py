@@ -1,8 +1,9 @@
 """Centreline refinement with the fleet's own drives: what the mask cannot say, the traces can.
 
 A raster knows neither whether two ends of roads with a gap between them are one road, nor whether two roads
-that cross also meet. Traces are matched to the graph four times: to tell which filled gaps are driven, to tell
-which junctions are real, to drop what nobody drives, and to say how often every edge and every turn was driven.
+that cross also meet, nor where a ramp leaves its road. Traces are matched to the graph again and again: to tell which
+filled gaps are driven, which junctions are real, what nobody drives, where forks belong, and at last how often every
+edge and every turn was driven.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from probe2road.disambiguate import DisambiguateOptions, split_false_junctions
 from probe2road.errors import OptionError
 from probe2road.evidence import EvidenceOptions, add_evidence
 from probe2road.fleet import Fleet
+from probe2road.forks import ForkOptions, move_forks
 from probe2road.gaps import GapOptions, drop_undriven, fill_gaps, gap_weights, prune_gaps
 from probe2road.mapmatch import MatchOptions, match
 from probe2road.passages import passing_positions
@@ -34,6 +36,7 @@ class RefineOptions:
     matching: MatchOptions = field(default_factory=MatchOptions)  # how traces are matched
     min_support: int | None = None  # traces that must drive on an edge for it to stay; 0 keeps all, None is as for move
     junctions: DisambiguateOptions = field(default_factory=DisambiguateOptions)  # which junctions are split
+    forks: ForkOptions = field(default_factory=ForkOptions)  # which forks are moved to where traces part
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)  # what counts as having driven an edge
     move: bool | None = None  # whether edges move to the middle of what was driven; None: see `for_segmenter`
     centreline: CentrelineOptions = field(default_factory=CentrelineOptions)  # how far they may
@@ -66,7 +69,7 @@ def refine_graph(
     work: Workspace | None = None,
     report: Progress | None = None,
 ) -> RoadGraph:
-    """Fill gaps, split false junctions and count drives, all by matching traces to the graph.
+    """Fill gaps, split false junctions, move forks and count drives, all by matching traces to the graph.
 
     Parameters
     ----------
@@ -119,6 +122,9 @@ def refine_graph(
     if driven is not graph:
         graph = clean_graph(driven, clean)
         matches = match(fleet, graph, options.matching)
+    moved = move_forks(graph, fleet, matches, options=options.forks)
+    if moved is not graph:
+        graph, matches = moved, match(fleet, moved, options.matching)
     graph = add_evidence(graph, fleet, matches, options=options.evidence)
     if options.move:
         graph = refine_centreline(graph, fleet, matches, options=options.centreline)
