@@ -423,6 +423,36 @@ def run(
     typer.echo(output / "index.md")
 
 
+@_benchmark.command()
+def ablate(
+    sets: Annotated[Path, typer.Argument(help="Folder of prepared data sets.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for page, cells and figures.")],
+    name: Annotated[str, typer.Option(help="Data set; not one that is only for testing.")] = "milan",
+    only: Annotated[str, typer.Option(help="Ablations, with commas: threshold,collapse; all without any.")] = "",
+    work: Annotated[Path | None, typer.Option(help="Folder that keeps graphs and scores.")] = None,
+    poses: Annotated[str, typer.Option(help="aligned (by align), modelled (as after an alignment), raw.")] = "aligned",
+    trainings: Annotated[Path | None, typer.Option(help="JSON of training experiments, to compare losses.")] = None,
+) -> None:
+    """Change one thing of the default at a time, score it, and draw a figure for each.
+
+    An interrupted run goes on where it stopped when it is started again.
+    """
+    from probe2road.comparison.ablate import run_ablations
+
+    with _progress_bar() as progress:
+        run_ablations(
+            sets,
+            output,
+            name=name,
+            only=[word.strip() for word in only.split(",") if word.strip()],
+            work=work,
+            poses=poses,
+            trainings=trainings,
+            progress=progress,
+        )
+    typer.echo(output / "index.md")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; an error of ours is one message and exit code 2."""
     # How much to say is said to the program, but may stand anywhere.

@@ -22,16 +22,30 @@ from probe2road.roadgraph import RoadGraph
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Stage", "draw_graph", "write_filmstrip"]
+__all__ = [
+    "BLUE",
+    "DPI",
+    "FRAME",
+    "INK",
+    "ORANGE",
+    "PURPLE",
+    "SOFT",
+    "Stage",
+    "draw_graph",
+    "save_figure",
+    "write_filmstrip",
+]
 
 logger = logging.getLogger(__name__)
 
 Bounds = tuple[float, float, float, float]
 
 _PANEL = 4.2  # inches, the longer side of a panel
-_DPI = 150
-_INK, _SOFT, _FRAME = "#1f2933", "#616e7c", "#cbd2d9"
-_ORIGIN_COLORS = {"segmentation": "#1c7ed6", "gap": "#f08c00", "reference": "#7048e8"}
+# The look, which other figures share.
+DPI = 150
+INK, SOFT, FRAME = "#1f2933", "#616e7c", "#cbd2d9"
+BLUE, ORANGE, PURPLE = "#1c7ed6", "#f08c00", "#7048e8"
+_ORIGIN_COLORS = {"segmentation": BLUE, "gap": ORANGE, "reference": PURPLE}
 _REFERENCE_COLOR = "#bfe3c6"
 _DEAD_END_COLOR = "#c92a2a"
 
@@ -114,14 +128,14 @@ def write_filmstrip(
         else:
             _draw_array(axis, stage.content, stage.grid, area)
             caption = stage.caption
-        axis.set_title(caption or " ", loc="left", fontsize=8.5, color=_SOFT, pad=4)
+        axis.set_title(caption or " ", loc="left", fontsize=8.5, color=SOFT, pad=4)
         axis.annotate(
             stage.title, (0, 1), (0, 18), xycoords="axes fraction", textcoords="offset points",
-            fontsize=11, fontweight="bold", color=_INK,
+            fontsize=11, fontweight="bold", color=INK,
         )  # fmt: skip
         _frame(axis, area)
     _scale_bar(axes[0], area)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def draw_graph(
@@ -166,7 +180,7 @@ def draw_graph(
     handles = []
     if fleet is not None and len(fleet.traces):
         left, bottom, right, top = area
-        resolution = max(right - left, top - bottom) / (width * _DPI)
+        resolution = max(right - left, top - bottom) / (width * DPI)
         grid = Grid.from_bounds(area, resolution=resolution, crs=graph.crs)
         _draw_array(axis, rasterize(fleet, grid)[0], grid, area)
         handles.append(("#8a97a6", 1.5, "traces"))
@@ -178,10 +192,17 @@ def draw_graph(
         (_ORIGIN_COLORS[origin], 1.8, origin) for origin in _ORIGIN_COLORS if (graph.edges["origin"] == origin).any()
     ]
     _legend(axis, handles)
-    axis.set_title(title, loc="left", fontsize=12, fontweight="bold", color=_INK)
+    axis.set_title(title, loc="left", fontsize=12, fontweight="bold", color=INK)
     _frame(axis, area)
     _scale_bar(axis, area)
-    _save(figure, path)
+    save_figure(figure, path)
+
+
+def save_figure(figure: Any, path: str | PathLike[str]) -> None:
+    """Write a figure of matplotlib as PNG; without metadata, so that equal pictures are equal files."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", facecolor="#ffffff", metadata={"Software": None})
+    logger.info("wrote %s", path)
 
 
 def _common_bounds(boxes: list[Bounds]) -> Bounds:
@@ -215,7 +236,7 @@ def _panels(area: Bounds, rows: int, columns: int, *, side: float = _PANEL, head
     longest = max(right - left, top - bottom)
     width, height = side * (right - left) / longest, side * (top - bottom) / longest
     width, height = max(width, 0.4 * side), max(height, 0.25 * side)  # a street from north to south needs a title too
-    figure = Figure(figsize=(columns * (width + 0.2) + 0.2, rows * (height + headroom + 0.15) + 0.1), dpi=_DPI)
+    figure = Figure(figsize=(columns * (width + 0.2) + 0.2, rows * (height + headroom + 0.15) + 0.1), dpi=DPI)
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
     total_width, total_height = figure.get_size_inches()
@@ -270,7 +291,7 @@ def _draw_edges(axis: Axes, graph: RoadGraph, *, scale: float = 1.0) -> None:
     degree = graph.degrees().to_numpy()
     position = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
     size = scale * float(np.clip(2000 / max(len(degree), 1), 1.5, 9.0))  # a city has too many nodes for large dots
-    for kind, color in ((degree >= 3, _INK), (degree <= 1, _DEAD_END_COLOR)):
+    for kind, color in ((degree >= 3, INK), (degree <= 1, _DEAD_END_COLOR)):
         axis.scatter(position[kind, 0], position[kind, 1], s=size, c=color, linewidths=0, zorder=4)
 
 
@@ -296,7 +317,7 @@ def _legend(axis: Axes, entries: list[tuple[str, float, str]]) -> None:
             borderaxespad=0.2,
             fontsize=9,
             frameon=False,
-            labelcolor=_INK,
+            labelcolor=INK,
         )
 
 
@@ -305,7 +326,7 @@ def _frame(axis: Axes, area: Bounds) -> None:
     left, bottom, right, top = area
     axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[], facecolor="#ffffff")
     for spine in axis.spines.values():
-        spine.set(color=_FRAME, linewidth=0.8)
+        spine.set(color=FRAME, linewidth=0.8)
 
 
 def _scale_bar(axis: Axes, area: Bounds) -> None:
@@ -316,13 +337,6 @@ def _scale_bar(axis: Axes, area: Bounds) -> None:
     length = power * max(step for step in (1, 2, 5) if step * power <= fifth)
     x, y = left + 0.03 * (right - left), bottom + 0.04 * (top - bottom)
     label = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
-    axis.plot([x, x + length], [y, y], color=_INK, linewidth=2, solid_capstyle="butt", zorder=6)
+    axis.plot([x, x + length], [y, y], color=INK, linewidth=2, solid_capstyle="butt", zorder=6)
     box = {"facecolor": "#ffffff", "edgecolor": "none", "alpha": 0.8, "pad": 1}
-    axis.annotate(label, (x, y), (0, 5), textcoords="offset points", fontsize=8, color=_INK, bbox=box, zorder=6)
-
-
-def _save(figure: Any, path: str | PathLike[str]) -> None:
-    """Write the figure; without metadata, so that equal pictures are equal files."""
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", facecolor="#ffffff", metadata={"Software": None})
-    logger.info("wrote %s", path)
+    axis.annotate(label, (x, y), (0, 5), textcoords="offset points", fontsize=8, color=INK, bbox=box, zorder=6)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,7 +31,7 @@ from probe2road.roadgraph import RoadGraph
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["Progress", "Workspace", "fingerprint", "open_workspace", "silent"]
+__all__ = ["Progress", "Workspace", "copy_first_stage", "fingerprint", "open_workspace", "silent"]
 
 logger = logging.getLogger(__name__)
 
@@ -163,6 +164,23 @@ def open_workspace(
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(mark, indent=1))
     return Workspace(folder)
+
+
+def copy_first_stage(folder: Path, target: Path) -> None:
+    """Start a workspace with the first stage of another, for a run that differs only in options of later stages.
+
+    Parameters
+    ----------
+    folder
+        Workspace whose first stage is complete.
+    target
+        The new workspace. `open_workspace` empties it if the run differs in more.
+    """
+    with atomic_path(target) as temporary:
+        temporary.mkdir()
+        for file in folder.iterdir():
+            if file.name == _MARK or file.name.startswith(_FIRST):
+                shutil.copy(file, temporary)
 
 
 def fingerprint(fleet: Fleet) -> str:

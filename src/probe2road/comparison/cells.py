@@ -8,12 +8,13 @@ only what it must.
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 import logging
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,8 +37,9 @@ from probe2road.io.fleet_writer import points_path
 from probe2road.metrics.evaluate import evaluate
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.roadgraph import RoadGraph
+from probe2road.workspace import copy_first_stage
 
-__all__ = ["FULL", "STAGES", "Cell", "build_cell", "read_built", "score_cells", "score_graph"]
+__all__ = ["FULL", "STAGES", "Cell", "build_cell", "read_built", "score_cells", "score_graph", "write_cells"]
 
 logger = logging.getLogger(__name__)
 
@@ -67,8 +69,18 @@ class Cell:
         return {**names, **self.figures, "config": json.dumps(dict(self.key))}
 
 
-def build_cell(source: Source, method: Method) -> Path:
-    """Build the graph of a method, unless it is there; returns its folder."""
+def build_cell(source: Source, method: Method, *, like: Method | None = None) -> Path:
+    """Build the graph of a method, unless it is there; returns its folder.
+
+    Parameters
+    ----------
+    source
+        The fleet.
+    method
+        What is built.
+    like
+        Method that differs behind the segmentation alone. It is built first, and its probability is taken.
+    """
     folder = source.place / method.name
     key = _key(source, method)
     if (kept := _read(folder / _RECORD)) is not None and kept["key"] == key:
@@ -77,6 +89,8 @@ def build_cell(source: Source, method: Method) -> Path:
         shutil.rmtree(folder)
     make_fleet(source)
     folder.mkdir(parents=True, exist_ok=True)
+    if like is not None and not (folder / STAGES).exists():
+        copy_first_stage(build_cell(source, like) / STAGES, folder / STAGES)
     resumed = (folder / STAGES).exists()  # then the seconds are not those of a whole build
     logger.info("building %s with %s", source.place.name, method.label)
     made = measure(_build, method, source.fleet_file, folder)
@@ -94,14 +108,16 @@ def score_cells(source: Source, method: Method) -> list[Cell]:
     """Score what `build_cell` made: every stage in every area."""
     folder = build_cell(source, method)
     built = _read(folder / _RECORD) or {}
+    key = {**built["key"], "min_drives": source.min_drives}
     cells = []
     for stage in (*method.stages, FULL):
         for area in source.areas:
-            path = folder / f"scores-{stage}-{area}.json".replace(" ", "_").replace(",", "")
+            name = f"scores-{stage}-{area}-{source.min_drives}.json"
+            path = folder / name.replace(" ", "_").replace(",", "")
             kept = _read(path)
-            if kept is None or kept["key"] != built["key"]:
+            if kept is None or kept["key"] != key:
                 logger.info("scoring %s, %s, in %s", method.label, stage, area)
-                kept = {"key": built["key"], **_score(source, method, folder, stage, area)}
+                kept = {"key": key, **_score(source, method, folder, stage, area)}
                 if stage == FULL:
                     kept["figures"] |= {name: built[name] for name in ("seconds", "megabytes", "resumed")}
                 _write(path, kept)
@@ -134,6 +150,15 @@ def score_graph(
         if row.metric == "lateral":
             figures |= {name: details[name] for name in ("median_m", "p95_m")}
     return tiles, figures
+
+
+def write_cells(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write rows of `Cell.as_row` as CSV; what a row does not have stays empty."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def _key(source: Source, method: Method) -> dict[str, Any]:

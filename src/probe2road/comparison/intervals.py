@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-__all__ = ["COUNTS", "Interval", "difference_interval", "f1_interval"]
+__all__ = ["COUNTS", "DRAWS", "Interval", "difference_interval", "f1_interval"]
 
 COUNTS = ["matched_proposal", "proposal", "matched_reference", "reference"]
 
-_DRAWS = 2000
+DRAWS = 2000
 _LEVEL = 0.95
 _SEED = 20120101
 
@@ -31,7 +31,7 @@ class Interval:
     high: float
 
 
-def f1_interval(tiles: pd.DataFrame, *, draws: int = _DRAWS, level: float = _LEVEL) -> Interval:
+def f1_interval(tiles: pd.DataFrame, *, draws: int = DRAWS, level: float = _LEVEL) -> Interval:
     """Return F1 over all tiles, and the interval in which it lies when tiles are drawn anew.
 
     Parameters
@@ -57,7 +57,7 @@ def f1_interval(tiles: pd.DataFrame, *, draws: int = _DRAWS, level: float = _LEV
 
 
 def difference_interval(
-    ours: pd.DataFrame, theirs: pd.DataFrame, *, draws: int = _DRAWS, level: float = _LEVEL
+    ours: pd.DataFrame, theirs: pd.DataFrame, *, draws: int = DRAWS, level: float = _LEVEL
 ) -> Interval:
     """Return by how much one F1 is above another, and the interval when the same tiles are drawn anew for both.
 

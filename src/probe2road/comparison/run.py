@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 from collections.abc import Sequence
 from pathlib import Path
 
 from probe2road.benchmark.datasets import find_dataset
-from probe2road.comparison.cells import Cell, read_built, score_cells
+from probe2road.comparison.cells import Cell, read_built, score_cells, write_cells
+from probe2road.comparison.intervals import DRAWS
 from probe2road.comparison.methods import Method, find_methods
 from probe2road.comparison.pictures import busiest_places, draw_place
 from probe2road.comparison.source import Source
@@ -128,7 +128,7 @@ def _write_tables(cells: Sequence[Cell], output: Path, poses: str) -> None:
     }
     head = (
         "# The paper's tables on open data\n\n"
-        f"Written by `probe2road benchmark run`, poses: {poses}. Intervals hold 95 % of {2000} draws of tiles of "
+        f"Written by `probe2road benchmark run`, poses: {poses}. Intervals hold 95 % of {DRAWS} draws of tiles of "
         "1 km by 1 km. References are the roads that at least four drives passed. What the numbers mean is said on the "
         "[page about them](../benchmark.md).\n"
     )
@@ -136,12 +136,7 @@ def _write_tables(cells: Sequence[Cell], output: Path, poses: str) -> None:
     pictures = [f"![{path.stem}]({path.name})\n" for path in sorted(output.glob("place-*.png"))]
     with atomic_path(output / _TABLES) as temporary:
         temporary.write_text("\n".join([head, *sections, *pictures]), encoding="utf-8")
-    rows = [cell.as_row() for cell in cells]
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    with atomic_path(output / "cells.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(rows)
+    write_cells([cell.as_row() for cell in cells], output / "cells.csv")
 
 
 def _draw_places(source: Source, methods: Sequence[Method], output: Path) -> None:

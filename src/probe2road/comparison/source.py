@@ -39,12 +39,13 @@ _SEED = 64
 
 @dataclass(frozen=True)
 class Source:
-    """A prepared data set, which of its fleets is taken, and where the work on it is kept."""
+    """A prepared data set, which of its fleets and roads are taken, and where the work on it is kept."""
 
     folder: Path
     work: Path
     poses: str = "aligned"  # one of POSES
     drives: int | None = None  # of each road at most, roughly; all where None
+    min_drives: int = 4  # of the whole fleet, that a road of the reference has
 
     def __post_init__(self) -> None:
         """Refuse unknown poses."""
@@ -74,8 +75,8 @@ class Source:
 
     @cached_property
     def reference(self) -> RoadGraph:
-        """The roads that at least four drives of the whole fleet passed."""
-        return labelled_reference(self.driven)
+        """The roads that enough drives of the whole fleet passed."""
+        return labelled_reference(self.driven, min_drives=self.min_drives)
 
     @cached_property
     def areas(self) -> dict[str, shapely.Geometry | None]:

@@ -10,7 +10,16 @@ from probe2road.comparison.methods import METHODS
 from probe2road.comparison.published import METHODS_TABLE, SOFT_F1_TABLE, STAGES_TABLE, VISION_TABLE, Triple
 from probe2road.metrics.scores import f_score, ratio
 
-__all__ = ["cost_table", "difference_table", "methods_table", "soft_table", "stages_table", "vision_table"]
+__all__ = [
+    "ablation_table",
+    "cost_table",
+    "difference_table",
+    "markdown_table",
+    "methods_table",
+    "soft_table",
+    "stages_table",
+    "vision_table",
+]
 
 _GRAPH_METRICS = ("geo", "itopo")
 _OURS = "probe2road"
@@ -24,7 +33,7 @@ def methods_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
         for cell in _full(cells, area):
             paper = METHODS_TABLE.get((area, cell.method))
             rows.append([area, METHODS[cell.method].label, *_pair(cell), *_paper_pair(paper)])
-    return _markdown(["area", "method", *_PAIR_HEADER], rows)
+    return markdown_table(["area", "method", *_PAIR_HEADER], rows)
 
 
 def soft_table(cells: Sequence[Cell]) -> str:
@@ -37,7 +46,7 @@ def soft_table(cells: Sequence[Cell]) -> str:
         triples = [*_triple(cell, "soft_f1"), *_triple(cell, "soft_f1_thinned")]
         rows.append([cell.area, METHODS[cell.method].label, *triples, "" if paper is None else f"{paper.f1:.3f}"])
     header = ["area", "method", "mask P", "R", "soft F1", "skeleton P", "R", "soft F1", "paper"]
-    return _markdown(header, rows)
+    return markdown_table(header, rows)
 
 
 def vision_table(cells: Sequence[Cell], area: str) -> str:
@@ -48,7 +57,7 @@ def vision_table(cells: Sequence[Cell], area: str) -> str:
         for name, paper in VISION_TABLE.items()
         if name in chosen
     ]
-    return _markdown(["area", "method", *_PAIR_HEADER], rows)
+    return markdown_table(["area", "method", *_PAIR_HEADER], rows)
 
 
 def stages_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
@@ -58,7 +67,7 @@ def stages_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
         for cell in (cell for cell in cells if cell.area == area and cell.method == _OURS):
             paper = STAGES_TABLE.get(cell.stage) if area == "boston" else None
             rows.append([area, cell.stage, *_pair(cell, digits=4), *_paper_pair(paper, digits=4)])
-    return _markdown(["area", "stage", *_PAIR_HEADER], rows)
+    return markdown_table(["area", "stage", *_PAIR_HEADER], rows)
 
 
 def difference_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
@@ -72,7 +81,7 @@ def difference_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
             pairs = [(chosen[_OURS].tiles[metric], chosen[name].tiles[metric]) for metric in _GRAPH_METRICS]
             ahead = [_with_interval(difference_interval(*pair), sign="+") for pair in pairs]
             rows.append([area, METHODS[name].label, *ahead])
-    return _markdown(["area", "Probe2Road ahead of", "GEO F1", "iTOPO F1"], rows)
+    return markdown_table(["area", "Probe2Road ahead of", "GEO F1", "iTOPO F1"], rows)
 
 
 def cost_table(cells: Sequence[Cell]) -> str:
@@ -91,7 +100,34 @@ def cost_table(cells: Sequence[Cell]) -> str:
             ]
         )  # fmt: skip
     header = ["area", "method", "TOPO F1", "APLS", "junctions F1", "lateral, m", "95 %, m", "nodes", "km", "s", "MB"]
-    return _markdown(header, rows)
+    return markdown_table(header, rows)
+
+
+def ablation_table(axis: str, rows: Sequence[tuple[str, Cell, Cell]]) -> str:
+    """Write what values of an option give.
+
+    Parameters
+    ----------
+    axis
+        What the values are.
+    rows
+        Value, its cell, and the cell of the default, which it is compared with on the same tiles.
+    """
+    lines = []
+    for value, cell, default in rows:
+        pairs = [(cell.tiles[metric], default.tiles[metric]) for metric in _GRAPH_METRICS]
+        scores = [_with_interval(f1_interval(tiles)) for tiles, _ in pairs]
+        ahead = ["" if cell is default else _with_interval(difference_interval(*pair), sign="+") for pair in pairs]
+        figures = f"{cell.figures['junctions_f1']:.3f}", f"{cell.figures['nodes']:.0f}", f"{cell.figures['km']:.1f}"
+        lines.append([value, scores[0], ahead[0], scores[1], ahead[1], *figures])
+    header = [axis, "GEO F1", "above default", "iTOPO F1", "above default", "junctions F1", "nodes", "km"]
+    return markdown_table(header, lines)
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Write a table in Markdown."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
 def _full(cells: Sequence[Cell], area: str) -> list[Cell]:
@@ -121,8 +157,3 @@ def _with_interval(interval: Interval, *, sign: str = "", digits: int = 3) -> st
 def _paper_pair(paper: tuple[Triple, Triple] | None, *, digits: int = 3) -> list[str]:
     """F1 of GEO and iTOPO as the paper has them."""
     return ["", ""] if paper is None else [f"{triple.f1:.{digits}f}" for triple in paper]
-
-
-def _markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"

@@ -1,0 +1,219 @@
+"""One command for all ablations: build, score, draw, and write a page with a table and a figure for each."""
+
+from __future__ import annotations
+
+import json
+import logging
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from probe2road.benchmark.datasets import find_dataset
+from probe2road.comparison.ablations import Ablation, Variant, find_ablations
+from probe2road.comparison.cells import FULL, Cell, build_cell, score_cells, write_cells
+from probe2road.comparison.figures import Point, draw_points
+from probe2road.comparison.intervals import DRAWS, Interval, f1_interval
+from probe2road.comparison.source import Source
+from probe2road.comparison.tables import ablation_table, markdown_table
+from probe2road.errors import InputError, OutputError
+from probe2road.io.atomic import atomic_path
+from probe2road.workspace import Progress, silent
+
+__all__ = ["run_ablations"]
+
+logger = logging.getLogger(__name__)
+
+_NOTES = "notes.toml"  # in the output: what the numbers mean, by name of the ablation
+_TRAININGS, _TRAININGS_TITLE = "loss", "Loss of the training"
+# Runs of benchmarks/training_experiments.py that have another loss.
+_LOSSES = {
+    "base": "BCE + Dice",
+    "cp_2x2": "CP-loss, buffer 2x2",
+    "cp_3x3": "CP-loss, buffer 3x3",
+    "cp_scratch": "CP-loss, 2x2, from step 1",
+}
+
+
+def run_ablations(
+    sets: str | Path,
+    output: str | Path,
+    *,
+    name: str = "milan",
+    only: Sequence[str] = (),
+    work: str | Path | None = None,
+    poses: str = "aligned",
+    trainings: str | Path | None = None,
+    progress: Progress | None = None,
+) -> dict[str, list[Cell]]:
+    """Build and score the variants of every ablation, draw them, and write a page about them.
+
+    Parameters
+    ----------
+    sets
+        Folder of the data sets that `probe2road.benchmark.prepare.prepare` made.
+    output
+        Folder for ``index.md``, ``cells.csv`` and a figure for each ablation; created where it does not exist. What
+        stands in its ``notes.toml`` under the name of an ablation goes into the page.
+    name
+        Data set. Of one with splits, its validation tiles are scored.
+    only
+        Out of `probe2road.comparison.ablations.ABLATIONS`; all where there is none.
+    work
+        Folder that keeps graphs and scores, from which an interrupted run goes on; it may be that of
+        `probe2road.comparison.run.run_benchmark`. ``work`` in the output without it.
+    poses
+        As for `probe2road.comparison.run.run_benchmark`.
+    trainings
+        JSON file of ``benchmarks/training_experiments.py``, from which the losses are compared.
+    progress
+        Called as the work goes on.
+
+    Returns
+    -------
+    dict of list of Cell
+        The scores of each ablation, in the order of its variants.
+
+    Raises
+    ------
+    OptionError
+        If there is no such data set, ablation or poses.
+    InputError
+        If the data set is not prepared, or trainings or notes cannot be read.
+    OutputError
+        If the folder cannot be created.
+    """
+    output, report = Path(output), progress or silent
+    source = Source(Path(sets) / find_dataset(name).name, Path(work) if work is not None else output / "work", poses)
+    ablations = find_ablations(only, source)
+    _ = source.digest  # says what is missing before hours of work
+    losses = {} if trainings is None else _read_losses(Path(trainings))
+    notes = _read_notes(output / _NOTES)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot be created ({error.strerror})", where=output) from error
+
+    if losses:
+        draw_points(output / f"{_TRAININGS}.png", _loss_points(losses), title=_TRAININGS_TITLE, joined=False)
+    cells: dict[str, list[Cell]] = {}
+    for number, ablation in enumerate(ablations):
+        report("ablations", number, len(ablations))
+        cells[ablation.name] = [_cell(variant) for variant in ablation.variants]
+        _draw(ablation, cells[ablation.name], output)
+        _write_page(ablations[: number + 1], cells, losses, notes, output)  # can be read while the rest runs
+    report("ablations", 1, 1)
+    return cells
+
+
+def _cell(variant: Variant) -> Cell:
+    """Build and score a variant; of a data set with splits, where it is validated."""
+    build_cell(variant.source, variant.method, like=variant.like)
+    full = [cell for cell in score_cells(variant.source, variant.method) if cell.stage == FULL]
+    return next((cell for cell in full if cell.area.endswith("validation")), full[0])
+
+
+def _draw(ablation: Ablation, cells: Sequence[Cell], output: Path) -> None:
+    """Draw the figure of an ablation; lines of several series leave no room for a third score."""
+    points = []
+    for variant, cell in zip(ablation.variants, cells, strict=True):
+        scores = {"GEO F1": f1_interval(cell.tiles["geo"]), "iTOPO F1": f1_interval(cell.tiles["itopo"])}
+        if not variant.series:
+            scores["junctions F1"] = _exact(cell.figures["junctions_f1"])
+        points.append(Point(variant.label, scores, variant.series))
+    path = output / f"{ablation.name}.png"
+    default, joined = ablation.default, ablation.joined
+    draw_points(path, points, title=ablation.title, axis=ablation.axis, default=default, joined=joined)
+
+
+def _write_page(
+    ablations: Sequence[Ablation],
+    cells: Mapping[str, Sequence[Cell]],
+    losses: Mapping[str, Mapping[str, Any]],
+    notes: Mapping[str, str],
+    output: Path,
+) -> None:
+    """Write the page, and the cells behind it."""
+    first = cells[ablations[0].name][0]
+    head = (
+        "# What matters: ablations beyond the paper\n\n"
+        f"Written by `probe2road benchmark ablate` from {first.area}, poses: {first.poses}. Each table changes one "
+        "thing of Probe2Road with GNSS and vision. Intervals, and the bars of the figures, hold 95 % of "
+        f"{DRAWS} draws of tiles of 1 km by 1 km. A difference from the default is drawn from the same tiles for "
+        "both, and is known better than either score.\n"
+    )
+    sections = [
+        _section(ablation.name, ablation.title, _tables(ablation, cells[ablation.name]), notes)
+        for ablation in ablations
+    ]
+    if losses:
+        sections.append(_section(_TRAININGS, _TRAININGS_TITLE, _loss_table(losses), notes))
+    with atomic_path(output / "index.md") as temporary:
+        temporary.write_text("\n".join([head, *sections]), encoding="utf-8")
+    rows = [
+        {"ablation": ablation.name, "series": variant.series, "value": variant.label, **cell.as_row()}
+        for ablation in ablations
+        for variant, cell in zip(ablation.variants, cells[ablation.name], strict=True)
+    ]
+    write_cells(rows, output / "cells.csv")
+
+
+def _section(name: str, title: str, table: str, notes: Mapping[str, str]) -> str:
+    """Lay out what the page says about one ablation."""
+    parts = [f"## {title}", notes.get(name, "").strip(), f"![{title}]({name}.png)", table]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _tables(ablation: Ablation, cells: Sequence[Cell]) -> str:
+    """Write a table for every series; each is compared with its own default, if it has one."""
+    pairs = list(zip(ablation.variants, cells, strict=True))
+    tables = []
+    for series in dict.fromkeys(variant.series for variant in ablation.variants):
+        chosen = {variant.label: cell for variant, cell in pairs if variant.series == series}
+        default = chosen[ablation.default]
+        rows = [(f"**{label}**" if cell is default else label, cell, default) for label, cell in chosen.items()]
+        tables.append(ablation_table(f"{ablation.axis} {series}".strip(), rows))
+    return "\n".join(tables)
+
+
+def _read_losses(path: Path) -> dict[str, dict[str, Any]]:
+    """Read the runs that differ in their loss, by label."""
+    try:
+        runs = json.loads(path.read_text(encoding="utf-8"))
+        losses = {label: runs[run] for run, label in _LOSSES.items() if run in runs}
+        _loss_table(losses)  # all that is needed is there
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        fix = "name a file that benchmarks/training_experiments.py wrote"
+        raise InputError(f"cannot be read as trainings ({error!r})", where=path, fix=fix) from error
+    if not losses:
+        raise InputError("has none of the runs of losses", where=path, fix=f"train {', '.join(_LOSSES)}")
+    return losses
+
+
+def _loss_points(losses: Mapping[str, Mapping[str, Any]]) -> list[Point]:
+    names = {"GEO F1": "geo_f1", "iTOPO F1": "itopo_f1", "soft F1": "soft_f1"}
+    return [Point(label, {score: _exact(run[name]) for score, name in names.items()}) for label, run in losses.items()]
+
+
+def _loss_table(losses: Mapping[str, Mapping[str, Any]]) -> str:
+    """Write what each loss gives on the validation squares of the training."""
+    rows = [
+        [point.label, *(f"{score.value:.3f}" for score in point.scores.values()), str(losses[point.label]["steps"])]
+        for point in _loss_points(losses)
+    ]
+    return markdown_table(["loss", "GEO F1", "iTOPO F1", "soft F1", "steps"], rows)
+
+
+def _read_notes(path: Path) -> dict[str, str]:
+    """Read what is to be said about ablations; nothing where there is no file."""
+    if not path.exists():
+        return {}
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"is not TOML: {error}", where=path) from error
+
+
+def _exact(value: float | None) -> Interval:
+    """Return a figure that has no interval; 0 where it is not defined."""
+    return Interval(value or 0.0, value or 0.0, value or 0.0)
