@@ -95,7 +95,13 @@ def run_ablations(
         raise OutputError(f"cannot be created ({error.strerror})", where=output) from error
 
     if losses:
-        draw_points(output / f"{_TRAININGS}.png", _loss_points(losses), title=_TRAININGS_TITLE, joined=False)
+        draw_points(
+            output / f"{_TRAININGS}.png",
+            _loss_points(losses),
+            title=_TRAININGS_TITLE,
+            default=_LOSSES["base"],
+            joined=False,
+        )
     cells: dict[str, list[Cell]] = {}
     for number, ablation in enumerate(ablations):
         report("ablations", number, len(ablations))
