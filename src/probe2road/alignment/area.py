@@ -102,7 +102,7 @@ def align_area(fleet: Fleet, options: AlignOptions, *, held: NDArray[np.bool_] |
     for settled, gates in ((False, options.gates[:_TRIAL_ROUNDS]), (True, options.gates)):
         spines = find_spines(replace(frames, pose=pose), scene.chains.placing, options)
         pose, floors, height = _register(scene, pose, spines, settled=settled)
-        pose, matches, rounds = _iterate(scene, pose, spines, floors, height, gates)
+        pose, matches, rounds = _iterate(scene, pose, spines, floors, height, gates, robust_gnss=settled)
     on = project(spines, pose, options)
     floor = floor_of(floors, on.cell, height, options)
     z = solve_heights(frames, floor, spines.z[np.maximum(on.station, 0)], options, held=scene.held)
@@ -116,11 +116,13 @@ def _iterate(
     floors: Floors,
     height: NDArray[np.float64],
     gates: tuple[float, ...],
+    *,
+    robust_gnss: bool,
 ) -> tuple[NDArray[np.float64], Matches, list[float]]:
     """Match and optimise in turn until the residuals stay as they are: poses, last matches, residual by round."""
     rounds: list[float] = []
     for gate in gates:
-        pose, matches = _round(scene, pose, spines, floors, height, gate)
+        pose, matches = _round(scene, pose, spines, floors, height, gate, robust_gnss=robust_gnss)
         rounds.append(float(np.median(np.abs(matches.residual))) if len(matches.residual) else 0.0)
         if len(rounds) > 1 and gate == min(gates) and abs(rounds[-2] - rounds[-1]) < scene.options.converged:
             break
@@ -187,6 +189,8 @@ def _round(
     floors: Floors,
     height: NDArray[np.float64],
     gate: float,
+    *,
+    robust_gnss: bool,
 ) -> tuple[NDArray[np.float64], Matches]:
     """Match points to lines and optimise: new poses, and the matches that led to them."""
     options, frame = scene.options, scene.seen.keyframe
@@ -207,7 +211,10 @@ def _round(
     held_patches = np.zeros(len(patch), bool)
     held_patches[patch[floor[at]][scene.held[frame[at]]]] = True
     centre = _patch_poses(spines, floors)
-    moved = optimise(scene.frames, pose, both, centre, options, held=scene.held, fixed_patch=held_patches)
+    moved = optimise(
+        scene.frames, pose, both, centre, options,
+        held=scene.held, fixed_patch=held_patches, robust_gnss=robust_gnss,
+    )  # fmt: skip
     return moved, matches
 
 

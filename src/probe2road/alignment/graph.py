@@ -4,10 +4,12 @@ Strategy
 --------
 A drive is a chain of poses held together by odometry. GNSS pulls weakly at each of them: its errors are alike for a
 kilometre, so each fix of the kilometre gets the share of one observation, and a robust kernel for the whole drive's
-sake. A patch of road is a pose as well, and everything that a keyframe saw of it is one factor between the two. What
-several drives see of one patch ties them together; where the patch lies is decided by all of them and their GNSS, so
-that no drive is the reference. Where the patch must not move, because the map around it is finished, the factor
-becomes a prior on the keyframe. Every factor is built in: none calls back into Python.
+sake; but not before all have been brought to where GNSS is on average, or else a road that registration put aside with
+all its drives would stay there, every fix of it an outlier. A patch of road is a pose as well, and everything that a
+keyframe saw of it is one factor between the two. What several drives see of one patch ties them together; where the
+patch lies is decided by all of them and their GNSS, so that no drive is the reference. Where the patch must not move,
+because the map around it is finished, the factor becomes a prior on the keyframe. Every factor is built in: none calls
+back into Python.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from probe2road.errors import needs_extra
 
 __all__ = ["optimise"]
 
-_GNSS_KERNEL = 2.0  # sigmas of one fix beyond which GNSS counts less (Cauchy)
+_GNSS_KERNEL = 4.0  # sigmas of one fix beyond which GNSS counts less (Cauchy)
 _SIGHT_KERNEL = 10.0  # sigmas of a condensed factor beyond which it counts less (Cauchy)
 _HEADING_SIGMA = 3.0  # degrees, of the recorded heading; weak, it only keeps patches from turning
 _PATCH_SIGMA = (20.0, 20.0, 0.1)  # m, m, radians; where a patch would be without anything said about it
@@ -39,6 +41,7 @@ def optimise(
     *,
     held: NDArray[np.bool_] | None = None,
     fixed_patch: NDArray[np.bool_] | None = None,
+    robust_gnss: bool = True,
 ) -> NDArray[np.float64]:
     """Find the poses that fit odometry, GNSS and what was seen best.
 
@@ -58,6 +61,8 @@ def optimise(
         Keyframes that do not move, shape ``(k,)``.
     fixed_patch
         Patches that do not move, shape ``(patches,)``.
+    robust_gnss
+        Whether fixes that are far off count less.
 
     Returns
     -------
@@ -78,7 +83,7 @@ def optimise(
     for k in moving.tolist():
         values.insert(k, gtsam.Pose2(*pose[k]))
     _add_motion(graph, frames, held)
-    _add_gnss(graph, frames, moving, options)
+    _add_gnss(graph, frames, moving, options, robust=robust_gnss)
     used = _add_sights(graph, pose, condensed, patch_pose, held, fixed)
     spread = gtsam.noiseModel.Diagonal.Sigmas(np.array(_PATCH_SIGMA))
     for patch in used.tolist():
@@ -108,7 +113,9 @@ def _add_motion(graph: object, frames: Keyframes, held: NDArray[np.bool_]) -> No
         graph.add(gtsam.BetweenFactorPose2(k - 1, k, gtsam.Pose2(*frames.motion[k]), noise))  # type: ignore[attr-defined]
 
 
-def _add_gnss(graph: object, frames: Keyframes, moving: NDArray[np.int64], options: AlignOptions) -> None:
+def _add_gnss(
+    graph: object, frames: Keyframes, moving: NDArray[np.int64], options: AlignOptions, *, robust: bool
+) -> None:
     """Add the recorded position and heading of every keyframe, weakened by what its neighbours share with it."""
     import gtsam
 
@@ -116,10 +123,11 @@ def _add_gnss(graph: object, frames: Keyframes, moving: NDArray[np.int64], optio
     turn = gtsam.noiseModel.Isotropic.Sigma(1, np.radians(_HEADING_SIGMA))
     for k in moving.tolist():
         at = gtsam.Pose2(*frames.pose[k])
-        kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(_GNSS_KERNEL / inflation[k])
         noise = gtsam.noiseModel.Isotropic.Sigma(2, frames.sigma[k] * inflation[k])
-        robust = gtsam.noiseModel.Robust.Create(kernel, noise)
-        graph.add(gtsam.PoseTranslationPrior2D(k, at, robust))  # type: ignore[attr-defined]
+        if robust:
+            kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(_GNSS_KERNEL / inflation[k])
+            noise = gtsam.noiseModel.Robust.Create(kernel, noise)
+        graph.add(gtsam.PoseTranslationPrior2D(k, at, noise))  # type: ignore[attr-defined]
         graph.add(gtsam.PoseRotationPrior2D(k, at, turn))  # type: ignore[attr-defined]
 
 
