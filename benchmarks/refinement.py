@@ -22,7 +22,7 @@ from probe2road.evidence import add_evidence
 from probe2road.export import read_graph
 from probe2road.fleet import Fleet
 from probe2road.forks import move_forks
-from probe2road.gaps import drop_undriven, fill_gaps, gap_weights, prune_gaps
+from probe2road.gaps import fill_gaps, gap_weights, prune_gaps
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.mapmatch import match
 from probe2road.metrics import evaluate
@@ -30,6 +30,7 @@ from probe2road.passages import passing_positions
 from probe2road.picture import draw_graph
 from probe2road.recipe import BuildOptions, build
 from probe2road.roadgraph import RoadGraph
+from probe2road.undriven import RungOptions, drop_undriven
 
 CITIES = ("boston", "hannover", "tokyo_shibuya")
 # Latitude and longitude of the densest interchanges.
@@ -98,7 +99,7 @@ def rows(fleet: Fleet, segmenter: str) -> list[Row]:
     note("guarded, with heights", split)
     graph, matches = split, match(fleet, split)
     if segmenter == "network":
-        graph = clean_graph(drop_undriven(graph, matches.steps))
+        graph = clean_graph(drop_undriven(graph, matches.steps, rungs=RungOptions()))
         matches = match(fleet, graph)
         note("undriven edges dropped", graph)
     graph = move_forks(graph, fleet, matches)

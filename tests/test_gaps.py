@@ -11,7 +11,7 @@ import shapely
 
 from probe2road.errors import OptionError
 from probe2road.gap_stems import facing_stems
-from probe2road.gaps import GapOptions, drop_undriven, fill_gaps, gap_weights, prune_gaps
+from probe2road.gaps import GapOptions, fill_gaps, gap_weights, prune_gaps
 from probe2road.roadgraph import RoadGraph, check_graph, empty_graph, graph_from_lines
 from probe2road.splitting import split_edges
 
@@ -218,16 +218,6 @@ class TestSplitEdges:
         check_graph(cut)
         assert cut.edges[["u", "v"]].to_numpy().tolist() == [[0, 1], [1, 0]]
         assert shapely.union_all(cut.edges.geometry.to_numpy()).length == pytest.approx(ring.length)
-
-
-def test_what_nobody_drives_is_dropped_with_its_turns():
-    graph = graph_from_lines([[(0, 0), (90, 0)], [(90, 0), (180, 0)], [(90, 0), (90, 8)]], crs="EPSG:32616")
-    steps = pd.DataFrame({"trace_id": [1, 1, 1, 2], "edge": [0, 1, 1, 0]})
-    assert drop_undriven(graph, steps).edges.index.tolist() == [0, 1]
-    assert drop_undriven(graph, steps, min_traces=2).edges.index.tolist() == [0]
-    assert drop_undriven(graph, steps, min_traces=0) is graph
-    with pytest.raises(OptionError, match="min_traces is -1"):
-        drop_undriven(graph, steps, min_traces=-1)
 
 
 BARS = [[(0, 0), (50, 0)], [(50, 0), (99, 0)], [(0, 20), (50, 20)], [(50, 20), (99, 20)]]

@@ -34,8 +34,9 @@ from probe2road.gap_links import (
 from probe2road.gap_stems import facing_stems
 from probe2road.roadgraph import RoadGraph, finish_edges
 from probe2road.splitting import split_edges
+from probe2road.undriven import traces_per_edge
 
-__all__ = ["GapOptions", "drop_undriven", "fill_gaps", "gap_weights", "prune_gaps"]
+__all__ = ["GapOptions", "fill_gaps", "gap_weights", "prune_gaps"]
 
 logger = logging.getLogger(__name__)
 
@@ -171,50 +172,9 @@ def prune_gaps(graph: RoadGraph, steps: pd.DataFrame, *, min_traces: int = 4) ->
     if min_traces < 0:
         raise OptionError(f"min_traces is {min_traces}", where="prune_gaps", fix="use a number that is not negative")
     through = steps[steps["entered"].astype(bool) & steps["left"].astype(bool)]
-    dropped = (graph.edges["origin"] == "gap").to_numpy() & (_distinct_traces(graph, through) < min_traces)
+    dropped = (graph.edges["origin"] == "gap").to_numpy() & (traces_per_edge(graph, through) < min_traces)
     why = f"of origin gap with fewer than {min_traces} traces"
     return merge_degree_two_nodes(drop_edges(graph, dropped, why=why))
-
-
-def drop_undriven(graph: RoadGraph, steps: pd.DataFrame, *, min_traces: int = 1) -> RoadGraph:
-    """Remove edges that too few traces drove on: rungs between parallel roads, and lines that are no road.
-
-    Parameters
-    ----------
-    graph
-        Any road graph.
-    steps
-        Matched paths on that graph: `probe2road.mapmatch.Matches.steps`.
-    min_traces
-        Distinct traces that must be matched to an edge; 0 keeps all.
-
-    Returns
-    -------
-    RoadGraph
-        Not merged; turns on removed edges are dropped. The graph itself where every edge is driven.
-
-    Raises
-    ------
-    OptionError
-        If ``min_traces`` is negative.
-
-    Examples
-    --------
-    >>> from probe2road.roadgraph import graph_from_lines
-    >>> graph = graph_from_lines([[(0, 0), (90, 0)], [(90, 0), (90, 8)]], crs="EPSG:32616")
-    >>> drop_undriven(graph, pd.DataFrame({"trace_id": [7], "edge": [0]})).edges.index.tolist()
-    [0]
-    """
-    if min_traces < 0:
-        raise OptionError(f"min_traces is {min_traces}", where="drop_undriven", fix="use a number that is not negative")
-    dropped = _distinct_traces(graph, steps) < min_traces
-    return drop_edges(graph, dropped, why=f"that fewer than {min_traces} traces drove on")
-
-
-def _distinct_traces(graph: RoadGraph, steps: pd.DataFrame) -> NDArray[np.int64]:
-    """Count the traces with a step on each edge."""
-    traces = steps.groupby("edge")["trace_id"].nunique()
-    return traces.reindex(graph.edges.index, fill_value=0).to_numpy(np.int64)
 
 
 def _chosen(ends: DeadEnds, links: Links, options: GapOptions) -> Links:

@@ -17,10 +17,11 @@ from probe2road.errors import OptionError
 from probe2road.evidence import EvidenceOptions, add_evidence
 from probe2road.fleet import Fleet
 from probe2road.forks import ForkOptions, move_forks
-from probe2road.gaps import GapOptions, drop_undriven, fill_gaps, gap_weights, prune_gaps
+from probe2road.gaps import GapOptions, fill_gaps, gap_weights, prune_gaps
 from probe2road.mapmatch import MatchOptions, match
 from probe2road.passages import passing_positions
 from probe2road.roadgraph import RoadGraph
+from probe2road.undriven import RungOptions, drop_undriven
 from probe2road.workspace import Progress, Workspace, silent
 
 __all__ = ["RefineOptions", "refine_graph"]
@@ -35,6 +36,7 @@ class RefineOptions:
     gaps: GapOptions = field(default_factory=GapOptions)  # which gaps are filled
     matching: MatchOptions = field(default_factory=MatchOptions)  # how traces are matched
     min_support: int | None = None  # traces that must drive on an edge for it to stay; 0 keeps all, None is as for move
+    rungs: RungOptions = field(default_factory=RungOptions)  # which edges need more than min_support
     junctions: DisambiguateOptions = field(default_factory=DisambiguateOptions)  # which junctions are split
     forks: ForkOptions = field(default_factory=ForkOptions)  # which forks are moved to where traces part
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)  # what counts as having driven an edge
@@ -117,7 +119,8 @@ def refine_graph(
 
     report("matching", 2, 4)
     matches = match(fleet, graph, options.matching)
-    driven = drop_undriven(graph, matches.steps, min_traces=options.min_support or 0)
+    rungs = options.rungs if options.min_support else None
+    driven = drop_undriven(graph, matches.steps, min_traces=options.min_support or 0, rungs=rungs)
     report("matching", 3, 4)
     if driven is not graph:
         graph = clean_graph(driven, clean)
