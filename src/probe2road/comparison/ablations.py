@@ -29,6 +29,8 @@ _DRIVES = (1, 2, 4, 8, 16, 32, 64)
 _NO_HEIGHTS = {"min_height": 0.0, "confidence": 1e9}
 _NO_SPLIT = {"min_count": 10**9, "max_inner": 0.0, **_NO_HEIGHTS}
 
+_FOLDER = str.maketrans({" ": "-", ",": None})  # from labels to names of folders
+
 Table = Mapping[str, Any]  # options, as TOML has them
 
 
@@ -204,8 +206,6 @@ def _of_options(
     variants = [Variant(label, source, method) for label, method in methods.items()]
     return Ablation(name, title, axis, variants, default, joined)
 
-
-_FOLDER = str.maketrans({" ": "-", ",": None})
 
 ABLATIONS: Mapping[str, Callable[[Source], Ablation]] = {
     "threshold": _threshold,

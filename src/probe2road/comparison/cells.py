@@ -89,7 +89,7 @@ def build_cell(source: Source, method: Method, *, like: Method | None = None) ->
         shutil.rmtree(folder)
     make_fleet(source)
     folder.mkdir(parents=True, exist_ok=True)
-    if like is not None and not (folder / STAGES).exists():
+    if like is not None:
         copy_first_stage(build_cell(source, like) / STAGES, folder / STAGES)
     resumed = (folder / STAGES).exists()  # then the seconds are not those of a whole build
     logger.info("building %s with %s", source.place.name, method.label)
