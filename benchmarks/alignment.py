@@ -9,8 +9,10 @@ aligns that, and the third one scores files that `probe2road align` wrote, or th
 Prints, before and after: the error of trajectories (root mean square, m), the median lateral error, the same where 15
 drives or more pass, the median error along, the robust standard deviation between the drives at a place (25 m of one
 road) of the lateral, the longitudinal and the vertical error, the share of drives of which more than half is nearer to
-the neighbouring lane than to its own, as the others see it, and the share of all poses that are. The last line counts
-what the shares are of: drives that five or more pass with somewhere. `--picture` draws the busiest place.
+the neighbouring lane than to its own, as the others see it, and the share of all poses that are; then the share of
+poses at places where all drives together, in the median, are off by more than half a lane, or by more than 2.5 m in
+height. The last two columns count what the shares are of: drives that five or more pass with somewhere, and their poses
+there. `--picture` draws the busiest place.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ from probe2road.io.fleet_writer import points_path
 from probe2road.simulate.fleet_simulation import simulate
 
 HALF_LANE = 1.75  # m
+HALF_DECK = 2.5  # m
 PLACE = 25.0  # m
 FEW, MANY = 5, 15  # drives at a place
 
@@ -97,7 +100,8 @@ def figures(table: pd.DataFrame) -> dict[str, float]:
     places = table.groupby(["section", "quarter", "column", "row"])
     drives = places["drive"].transform("nunique")
     shared = drives >= FEW
-    between = {name: (table[name] - places[name].transform("median"))[shared] for name in ("left", "ahead", "up")}
+    middle = places[["left", "ahead", "up"]].transform("median")[shared]
+    between = {name: table[name][shared] - middle[name] for name in middle}
     off = between["left"].abs() > HALF_LANE
     drives_off = off.groupby(table["drive"][shared]).mean() > 0.5
     busy = table["left"][drives >= MANY].abs()
@@ -109,6 +113,8 @@ def figures(table: pd.DataFrame) -> dict[str, float]:
         **{f"spread {name}": 1.4826 * float(values.abs().median()) for name, values in between.items()},
         "drives off": float(drives_off.mean()),
         "poses off": float(off.mean()),
+        "places off": float((middle["left"].abs() > HALF_LANE).mean()),
+        "places up": float((middle["up"].abs() > HALF_DECK).mean()),
         "of drives": len(drives_off),
         "of poses": len(off),
     }
