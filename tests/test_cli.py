@@ -94,7 +94,7 @@ def test_view_draws_a_page_or_a_picture(folder, built, call, name):
 
 
 def test_intermediate_stages_are_kept_on_request(folder, call):
-    options = ("--keep-intermediate", "stages", "--resolution", "2", "-q")
+    options = ("--keep-intermediate", "stages", "--segmenter", "density", "--resolution", "2", "-q")
     assert call("build", "drives.csv", *COLUMNS, *options, "-o", "coarse.gpkg") == (0, "", "")
     names = {path.name for path in (folder / "stages").iterdir()}
     assert names >= {"1-probability.tif", "2-mask.tif", "3-skeleton.tif", "4-vectorized.gpkg", "7-roads.gpkg"}
@@ -118,7 +118,7 @@ def test_options_come_from_toml(folder, call):
         (["build", "drives.csv", *COLUMNS, "-o", "absent/x.gpkg"], "does not exist; create it first"),
         (["build", "drives.csv", *COLUMNS, "--bbox", "1,2,3", "-o", "x.gpkg"], "left,bottom,right,top"),
         (["build", "drives.csv", "--columns", "trip", "-o", "x.gpkg"], "ours=theirs"),
-        (["build", "drives.csv", *COLUMNS, "--segmenter", "magic", "-o", "x.gpkg"], "use auto, network, density"),
+        (["build", "drives.csv", *COLUMNS, "--segmenter", "magic", "-o", "x.gpkg"], "use network, density"),
         (
             ["build", "drives.csv", *COLUMNS, "--weights", "absent.onnx", "-o", "x.gpkg"],
             "absent.onnx: weights cannot be",

@@ -80,9 +80,7 @@ def build(
     bbox: Bbox = None,
     delimiter: Delimiter = None,
     no_header: NoHeader = False,
-    segmenter: Annotated[
-        str | None, typer.Option(help="auto (network where there are points), network, density.")
-    ] = None,
+    segmenter: Annotated[str | None, typer.Option(help="network or density.")] = None,
     weights: Annotated[
         Path | None, typer.Option(help="Weights file of the network; the shipped one without it.")
     ] = None,

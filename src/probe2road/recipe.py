@@ -33,7 +33,7 @@ __all__ = ["SEGMENTERS", "BuildOptions", "Progress", "build", "draw_stages"]
 
 logger = logging.getLogger(__name__)
 
-SEGMENTERS = ("auto", "network", "density")
+SEGMENTERS = ("network", "density")
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class BuildOptions:
     """Everything that decides which graph comes out."""
 
     resolution: float = 1.0  # m per pixel
-    segmenter: str = "auto"  # one of SEGMENTERS; auto: a network where there are semantic points, else density
+    segmenter: str = "network"  # one of SEGMENTERS
     gaps: TraceGaps = field(default_factory=TraceGaps)  # where traces are broken
     network: NetworkOptions = field(default_factory=NetworkOptions)  # of the learned segmenter
     density: DensityOptions = field(default_factory=DensityOptions)  # of the density segmenter
@@ -118,7 +118,7 @@ def build(
     """
     options, report = options or BuildOptions(), progress or silent
     grid = fleet_grid(fleet, resolution=options.resolution)
-    learned = options.segmenter == "network" or (options.segmenter == "auto" and len(fleet.points) > 0)
+    learned = options.segmenter == "network"
     weights = find_weights(fleet, options.network) if learned else None
     digest = weights.digest if weights else None
     work = open_workspace(workspace, fleet, options, weights=digest, first=options.segmentation)
