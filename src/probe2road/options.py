@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from probe2road.errors import OptionError
 
-__all__ = ["load_options", "options_from_table"]
+__all__ = ["changed_by", "load_options", "options_from_table", "read_toml"]
 
 T = TypeVar("T")
 
@@ -22,13 +23,23 @@ def load_options(path: str | Path, kind: type[T]) -> T:
     OptionError
         If the file cannot be read, is not TOML, or sets something the dataclass does not have.
     """
+    return options_from_table(read_toml(path), kind, where=path)
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises
+    ------
+    OptionError
+        If the file cannot be read or is not TOML.
+    """
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise OptionError(f"cannot be read ({error.strerror})", where=path) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise OptionError(f"is not TOML: {error}", where=path) from error
-    return options_from_table(table, kind, where=path)
 
 
 def options_from_table(table: dict[str, Any], kind: type[T], *, where: object = None) -> T:
@@ -49,21 +60,27 @@ def options_from_table(table: dict[str, Any], kind: type[T], *, where: object = 
         ...
     probe2road.errors.OptionError: build.toml: there is no option 'deadend'; use short_edge, max_ring, ...
     """
-    return _replaced(kind(), table, where)
+    return changed_by(kind(), table, where=where)
 
 
-def _replaced(defaults: Any, table: dict[str, Any], where: object) -> Any:
-    """Return a dataclass with the fields that a table sets; nested tables change nested defaults."""
+def changed_by(defaults: T, table: dict[str, Any], *, where: object = None) -> T:
+    """Return a dataclass with the fields that a table sets; nested tables change nested dataclasses.
+
+    Raises
+    ------
+    OptionError
+        As `options_from_table`.
+    """
     hints = get_type_hints(type(defaults))
-    names = [field.name for field in fields(defaults)]
+    names = [field.name for field in fields(defaults)]  # type: ignore[arg-type]  # of a dataclass
     values = {}
     for name, value in table.items():
         if name not in names:
             raise OptionError(f"there is no option {name!r}", where=where, fix=f"use {', '.join(names)}")
         default, place = getattr(defaults, name), f"{where}: {name}" if where else name
         nested = is_dataclass(default) and isinstance(value, dict)
-        values[name] = _replaced(default, value, place) if nested else _converted(value, hints[name], place)
-    return replace(defaults, **values)
+        values[name] = changed_by(default, value, where=place) if nested else _converted(value, hints[name], place)
+    return replace(defaults, **values)  # type: ignore[type-var]
 
 
 def _converted(value: Any, hint: Any, where: str) -> Any:
@@ -76,7 +93,9 @@ def _converted(value: Any, hint: Any, where: str) -> Any:
         return tuple(_converted(*pair, f"{where}[{n}]") for n, pair in enumerate(zip(value, kinds, strict=True)))
     if is_dataclass(hint) and isinstance(value, dict):
         defaults: Any = hint
-        return _replaced(defaults(), value, where)
+        return changed_by(defaults(), value, where=where)
+    if get_origin(hint) is Mapping and isinstance(value, dict):
+        return {name: _converted(entry, get_args(hint)[1], f"{where}: {name}") for name, entry in value.items()}
     allowed = get_args(hint) or (hint,)
     if float in allowed and type(value) is int:
         return float(value)

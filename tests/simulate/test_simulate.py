@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe2road.errors import InputError, OptionError
+from probe2road.errors import OptionError
 from probe2road.fleet import fleet_from_tables, trace_breaks
 from probe2road.roadgraph import check_graph
 from probe2road.simulate.fleet_simulation import simulate, simulate_chunks
@@ -156,31 +156,33 @@ def test_bad_amounts_are_refused(network, options, message):
 
 def test_a_preset_file_changes_what_it_names(tmp_path):
     path = tmp_path / "wide.toml"
-    path.write_text('base = "open_sky"\n[camera]\nfar = 60\n[recording]\nfix_interval = [2, 4]\n')
+    changes = ['base = "open_sky"', "[camera]", "far = 60", "[recording]", "fix_interval = [2, 4]"]
+    path.write_text("\n".join([*changes, "[surroundings.exposure]", "motorway = 1"]))
     preset = find_preset(path)
     assert preset.name == "wide"
     assert preset.camera == replace(PRESETS["open_sky"].camera, far=60.0)
     assert preset.recording.fix_interval == (2.0, 4.0)
+    assert preset.surroundings.exposure == {"motorway": 1.0}
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("base = 'sunny'", "base 'sunny' is unknown"),
-        ("[camera]\nzoom = 3", "unknown: zoom"),
-        ("[camera]\nfar = 'wide'", "far is 'wide'"),
-        ("[lidar]\nrange = 3", "nothing of this name"),
-        ("base = 'phone'\n[camera]\nfar = 3", "nothing of this name"),
+        ("[camera]\nzoom = 3", "there is no option 'zoom'"),
+        ("[camera]\nfar = 'wide'", "camera: far: 'wide' is not of type float"),
+        ("[lidar]\nrange = 3", "there is no option 'lidar'"),
+        ("base = 'phone'\n[camera]\nfar = 3", "is not of type CameraModel"),
         ("[camera", "is not TOML"),
     ],
 )
 def test_a_bad_preset_file_is_refused(tmp_path, text, message):
     path = tmp_path / "bad.toml"
     path.write_text(text)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(OptionError, match=message):
         read_preset(path)
 
 
 def test_a_missing_preset_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(OptionError, match="cannot be read"):
         find_preset(tmp_path / "none.toml")

@@ -6,13 +6,12 @@ repeats the fits, and docs/results/calibration.md compares the outcome with the 
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
-from probe2road.errors import InputError, OptionError
+from probe2road.errors import OptionError
+from probe2road.options import changed_by, read_toml
 from probe2road.simulate.camera import CameraModel
 from probe2road.simulate.gnss import GnssModel
 from probe2road.simulate.odometry import FusionModel, OdometryModel
@@ -196,42 +195,11 @@ def read_preset(path: str | Path) -> Preset:
 
     Raises
     ------
-    InputError
-        If the file cannot be read, is not TOML, or names a table or field that does not exist.
+    OptionError
+        If the file cannot be read, is not TOML, or sets what a preset does not have.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path, fix="check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"is not TOML ({error})", where=path, fix="correct the file") from error
+    content = read_toml(path)
     base = str(content.pop("base", "mixed"))
     if base not in PRESETS:
-        raise InputError(f"base {base!r} is unknown", where=path, fix=f"use {', '.join(PRESETS)}")
-    preset = replace(PRESETS[base], name=str(content.pop("name", Path(path).stem)))
-    parts = {
-        name: _changed(getattr(preset, name, None), values, f"{path}: table {name!r}")
-        for name, values in content.items()
-    }
-    return replace(preset, **parts)
-
-
-def _changed(model: Any, values: Any, where: str) -> Any:
-    """Return a copy of a model with fields replaced; refuse what it does not have."""
-    if not is_dataclass(model) or isinstance(model, type) or not isinstance(values, Mapping):
-        raise InputError("there is nothing of this name to change", where=where, fix="use a part that the base has")
-    known = {entry.name: getattr(model, entry.name) for entry in fields(model)}
-    unknown = sorted(set(values) - set(known))
-    if unknown:
-        raise InputError(f"unknown: {', '.join(unknown)}", where=where, fix=f"known are {', '.join(known)}")
-    typed = {}
-    for name, value in values.items():
-        kind = type(known[name])
-        if kind is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if kind is tuple and isinstance(value, list):
-            value = tuple(float(item) for item in value)
-        if not isinstance(value, kind):
-            raise InputError(f"{name} is {value!r}", where=where, fix=f"use a {kind.__name__}")
-        typed[name] = value
-    return replace(model, **typed)
+        raise OptionError(f"base {base!r} is unknown", where=path, fix=f"use {', '.join(PRESETS)}")
+    return changed_by(PRESETS[base], {"name": Path(path).stem, **content}, where=path)
