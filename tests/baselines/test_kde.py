@@ -156,6 +156,14 @@ class TestGraph:
         assert graph.edges[["u", "v"]].nunique(axis=1).tolist() == [1]
         assert graph.length == pytest.approx(2 * np.pi * 6, rel=0.1)
 
+    def test_what_joins_two_levels_upright_is_no_edge(self) -> None:
+        volume = np.zeros((31, 31, 8), bool)
+        volume[15, 2:29, 1] = volume[2:29, 15, 5] = True
+        volume[15, 15, 1:6] = True
+        graph = graph_from_volume(pillars_of(volume), self.grid, floor=0.0, height=3.0)
+        check_graph(graph)
+        assert sorted(graph.degrees()) == [1, 1, 1, 1, 2, 2]
+
     def test_empty(self) -> None:
         graph = graph_from_volume(pillars_of(np.zeros((2, 2, 2), bool)), self.grid, floor=0.0, height=3.0)
         assert len(graph.edges) == len(graph.nodes) == 0

@@ -10,6 +10,7 @@ their mean. Every link is a short edge of a graph at first; merging nodes of deg
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from itertools import combinations, product
 
 import geopandas as gpd
@@ -20,7 +21,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from probe2road.baselines.volume import Pillars
-from probe2road.clean import merge_degree_two_nodes
+from probe2road.clean import drop_edges, merge_degree_two_nodes
 from probe2road.grid import Grid
 from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
 
@@ -75,12 +76,13 @@ def graph_from_volume(
     nodes = gpd.GeoDataFrame(geometry=shapely.points(position[used]), index=used, crs=grid.crs)
     graph = merge_degree_two_nodes(RoadGraph(nodes.rename_axis("node"), finish_edges(edges), empty_turns()))
     simple = shapely.simplify(graph.edges.geometry.to_numpy(), tolerance, preserve_topology=False)
-    # A loop that would fall flat keeps its vertices.
+    # A loop that would fall flat keeps its vertices, and so does a line that ends above its start.
     flat = (graph.edges["u"] == graph.edges["v"]).to_numpy() & (shapely.get_num_coordinates(simple) < 4)
+    flat |= shapely.length(simple) == 0
     simple[flat] = graph.edges.geometry.to_numpy()[flat]
     logger.info("%d voxels became %d edges", len(row), len(simple))
-    edges = finish_edges(graph.edges.set_geometry(simple, crs=grid.crs))
-    return RoadGraph(graph.nodes, edges, graph.turns)
+    graph = replace(graph, edges=finish_edges(graph.edges.set_geometry(simple, crs=grid.crs)))
+    return drop_edges(graph, shapely.length(simple) == 0, why="that are upright")
 
 
 def voxel_links(
