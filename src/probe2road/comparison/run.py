@@ -129,8 +129,7 @@ def _write_tables(cells: Sequence[Cell], output: Path, poses: str) -> None:
     head = (
         "# The paper's tables on open data\n\n"
         f"Written by `probe2road benchmark run`, poses: {poses}. Intervals hold 95 % of {DRAWS} draws of tiles of "
-        "1 km by 1 km. References are the roads that at least four drives passed. What the numbers mean is said on the "
-        "[page about them](../benchmark.md).\n"
+        "1 km by 1 km. References are the roads that at least four drives passed.\n"
     )
     sections = [f"## {title}\n\n{table}" for title, table in parts.items() if table.count("\n") > 2]
     pictures = [f"![{path.stem}]({path.name})\n" for path in sorted(output.glob("place-*.png"))]
