@@ -36,9 +36,10 @@ class TrainedNetwork(NamedTuple):
 
 
 def save_network(network: T2RNet, path: str | Path, *, variant: str, features: FeatureOptions) -> None:
-    """Write the weights of a network and what they need to be used; the file is complete or absent."""
+    """Write the weights of a network, in half precision, and what they need to be used; complete or absent."""
     width = network.region_head.in_channels
-    state = {"width": width, "variant": variant, "features": asdict(features), "network": network.state_dict()}
+    halves = {name: part.half() if part.is_floating_point() else part for name, part in network.state_dict().items()}
+    state = {"width": width, "variant": variant, "features": asdict(features), "network": halves}
     with atomic_path(path) as temporary:
         torch.save(state, temporary)
 
