@@ -12,12 +12,10 @@ which differs by 1.1 degrees in Nagoya and by 0.3 on I-280.
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from pyproj import Proj
 
 from probe2road.align import align
 from probe2road.crs import WGS84, transform
@@ -41,7 +39,7 @@ def nagoya(folder: Path) -> tuple[Fleet, np.ndarray, np.ndarray]:
         | {"z": rover[4], "speed": np.interp(seconds, at, speed), "heading": np.interp(seconds, at, heading) % 360.0}
         | {"accuracy": np.hypot(rover[7], rover[8]) / np.sqrt(2.0)}
     )
-    fleet = with_grid_headings(fleet_from_tables(table, crs="EPSG:4326"))
+    fleet = fleet_from_tables(table, crs="EPSG:4326")
     x, y = transform(reference["Longitude"].to_numpy(), reference["Latitude"].to_numpy(), WGS84, fleet.crs)
     return fleet, week + at, np.column_stack([x, y])
 
@@ -56,18 +54,10 @@ def i280(folder: Path) -> tuple[Fleet, np.ndarray, np.ndarray]:
         | {"x": rover["longitude_deg"], "y": rover["latitude_deg"], "z": rover["altitude_m"]}
         | {"speed": rover["speed_m_s"], "heading": rover["bearing_deg"], "accuracy": 1.5}
     )
-    fleet = with_grid_headings(fleet_from_tables(table, crs="EPSG:4326"))
+    fleet = fleet_from_tables(table, crs="EPSG:4326")
     longitude, latitude = reference["longitude_deg"].to_numpy(), reference["latitude_deg"].to_numpy()
     x, y = transform(longitude, latitude, WGS84, fleet.crs)
     return fleet, reference["boot_time_s"].to_numpy(), np.column_stack([x, y])
-
-
-def with_grid_headings(fleet: Fleet) -> Fleet:
-    """A fleet whose headings count from true north, turned to the north of its CRS."""
-    traces = fleet.traces
-    longitude, latitude = transform(traces["x"].to_numpy(), traces["y"].to_numpy(), fleet.crs, WGS84)
-    convergence = Proj(fleet.crs).get_factors(longitude, latitude).meridian_convergence
-    return replace(fleet, traces=traces.assign(heading=(traces["heading"] - convergence) % 360.0))
 
 
 def _tow(rover: pd.DataFrame) -> np.ndarray:

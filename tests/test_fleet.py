@@ -194,3 +194,16 @@ def test_limits_of_gaps_are_options() -> None:
     assert breaks_of([0, 1, 2, 9, 10], [0, 10, 20, 90, 100], TraceGaps(max_interval=10)) == [0]
     with pytest.raises(OptionError, match="max_step is 0"):
         TraceGaps(max_step=0)
+
+
+def test_headings_turn_with_the_north_of_the_crs():
+    # A drive due east along a parallel, in the east of a UTM zone: there and back its headings are as they were.
+    table = pd.DataFrame({"trace_id": 1, "t": [0, 1, 2], "x": [11.8, 11.85, 11.9], "y": 50.0, "heading": 90.0})
+    fleet = fleet_from_tables(table, crs="EPSG:4326", target_crs="EPSG:32632")
+    xy = fleet.traces[["x", "y"]].to_numpy()
+    driven = np.degrees(np.arctan2(*(xy[2] - xy[0]))) % 360
+    assert fleet.traces["heading"].to_numpy() == pytest.approx(driven, abs=0.1)
+    assert abs(driven - 90.0) > 1.0
+    other = fleet.to_crs("EPSG:32633")
+    assert other.traces["heading"].iloc[0] > 90.0
+    assert other.to_crs("EPSG:32632").traces["heading"].to_numpy() == pytest.approx(fleet.traces["heading"], abs=1e-3)

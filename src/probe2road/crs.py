@@ -10,13 +10,22 @@ import logging
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Proj, Transformer
 from pyproj.exceptions import CRSError as ProjCRSError
 
 from probe2road.errors import CRSError
 
-__all__ = ["WGS84", "is_true_to_scale", "local_crs", "parse_crs", "require_metric", "same_crs", "transform"]
+__all__ = [
+    "WGS84",
+    "is_true_to_scale",
+    "local_crs",
+    "parse_crs",
+    "require_metric",
+    "same_crs",
+    "transform",
+    "turn_headings",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -25,6 +34,7 @@ WGS84 = CRS.from_epsg(4326)
 _UTM_ZONE_WIDTH = 6.0  # degrees of longitude
 _UTM_ZONE_OVERHANG = 0.5  # degrees a data set may reach into the next zone and still use this one
 _SCALE_TOLERANCE = 2e-3  # of a projection that may stay the CRS of a run
+_NORTH_DEGREES, _NORTH_METRES = 1e-4, 10.0  # how far north a place is looked at to find where north is
 _UTM_LATITUDES = (-80.0, 84.0)  # degrees; outside, UTM is not defined
 
 
@@ -173,6 +183,37 @@ def transform(x: ArrayLike, y: ArrayLike, source: CRS, target: CRS) -> tuple[Any
     if source == target:
         return x, y
     return Transformer.from_crs(source, target, always_xy=True).transform(x, y)
+
+
+def turn_headings(heading: ArrayLike, x: ArrayLike, y: ArrayLike, source: CRS, target: CRS) -> NDArray[np.float64]:
+    """Turn headings from the north of one CRS to that of another, which may be some degrees apart.
+
+    Parameters
+    ----------
+    heading
+        Degrees clockwise from the direction in which y grows in the source CRS; true north for longitude and latitude.
+    x, y
+        Where they were taken, in the source CRS.
+    source, target
+        The CRS.
+
+    Returns
+    -------
+    ndarray of float64
+        Degrees in [0, 360), clockwise from the direction in which y grows in the target CRS; NaN where it was.
+
+    Examples
+    --------
+    In the east of a UTM zone, the meridians lean to the left of its grid:
+
+    >>> turn_headings([0.0, 90.0], [11.9, 11.9], [50.0, 50.0], WGS84, CRS.from_epsg(32632)).round(1)
+    array([357.8,  87.8])
+    """
+    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    north = y + (_NORTH_DEGREES if source.is_geographic else _NORTH_METRES)
+    here, there = (np.stack(transform(x, place, source, target)) for place in (y, north))
+    east, up = there - here
+    return np.asarray((np.asarray(heading, np.float64) + np.degrees(np.arctan2(east, up))) % 360.0)
 
 
 def _degree_extent(lon: ArrayLike, lat: ArrayLike) -> tuple[float, float, float, float]:

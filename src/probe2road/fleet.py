@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from probe2road.crs import WGS84, is_true_to_scale, local_crs, parse_crs, require_metric, transform
+from probe2road.crs import WGS84, is_true_to_scale, local_crs, parse_crs, require_metric, transform, turn_headings
 from probe2road.errors import CRSError, InputError, OptionError
 from probe2road.fleet_tables import (
     POINT_KINDS,
@@ -39,7 +39,7 @@ class Fleet:
     traces
         One row per fix, sorted by ``(trace_id, t)``: ``trace_id``, ``t`` (UTC; NaT throughout a trace that
         has no clock, whose rows are then in driving order), ``x``, ``y``, ``z`` (metres; ``z`` may be NaN);
-        optional ``vehicle_id``, ``heading`` (degrees clockwise from north), ``speed`` (m/s), ``accuracy``
+        optional ``vehicle_id``, ``heading`` (degrees clockwise from grid north), ``speed`` (m/s), ``accuracy``
         (1 sigma, metres).
     points
         One row per semantic point: ``trace_id``, ``t``, ``x``, ``y``, ``z``, ``kind`` (one of
@@ -273,10 +273,13 @@ def _is_metric(crs: CRS) -> bool:
 
 
 def _projected(table: pd.DataFrame, source: CRS, target: CRS) -> pd.DataFrame:
-    """Return the table with x and y in the target CRS."""
+    """Return the table with x and y, and headings where there are any, in the target CRS."""
     if source == target or table.empty:
         return table
-    x, y = transform(table["x"].to_numpy(), table["y"].to_numpy(), source, target)
+    old = table["x"].to_numpy(), table["y"].to_numpy()
+    x, y = transform(*old, source, target)
+    if "heading" in table:
+        table = table.assign(heading=turn_headings(table["heading"].to_numpy(), *old, source, target))
     return table.assign(x=x, y=y)
 
 

@@ -123,7 +123,7 @@ def _add_gnss(
     turn = gtsam.noiseModel.Isotropic.Sigma(1, np.radians(_HEADING_SIGMA))
     for k in moving.tolist():
         at = gtsam.Pose2(*frames.pose[k])
-        noise = gtsam.noiseModel.Isotropic.Sigma(2, frames.sigma[k] * inflation[k])
+        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(2, frames.sigma[k] * inflation[k])
         if robust:
             kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(_GNSS_KERNEL / inflation[k])
             noise = gtsam.noiseModel.Robust.Create(kernel, noise)

@@ -78,7 +78,7 @@ def draw_points(
     if default in labels:
         middle = labels.index(default) + _APART * (len(series) - 1) / 2
         axes.axvspan(middle - 0.3, middle + 0.3, color=FRAME, alpha=0.45, linewidth=0, zorder=0)
-    ticks = [textwrap.fill(f"{label} (default)" if label == default else label, _LABEL) for label in labels]
+    ticks = [textwrap.fill(label, _LABEL) + ("\n(default)" if label == default else "") for label in labels]
     axes.set_xticks(range(len(labels)), ticks)
     axes.set_xlim(-0.5, len(labels) - 0.5 + _APART * (len(series) - 1))
     axes.set_xlabel(axis, fontsize=8.5, color=SOFT)
