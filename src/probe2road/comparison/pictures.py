@@ -74,9 +74,9 @@ def draw_place(path: Path, bounds: Bounds, fleet: Fleet, reference: RoadGraph, g
     below = _within(reference, bounds)
     panels = [Stage("Traces", rasterize(fleet, grid)[0], grid, "each pixel counts fixes of drives")]
     for title, graph in graphs.items():
-        part = _within(graph, bounds)
-        dead_ends = int((part.degrees() == 1).sum())
-        panels.append(Stage(title, part, caption=f"{len(part.edges)} edges, {dead_ends} dead ends", reference=below))
+        inside = graph.degrees()[graph.nodes.geometry.within(shapely.box(*bounds))]
+        caption = f"{(inside >= 3).sum()} junctions, {(inside == 1).sum()} dead ends"
+        panels.append(Stage(title, _within(graph, bounds), caption=caption, reference=below))
     write_filmstrip(panels, path, bounds=bounds, columns=_COLUMNS)
 
 
