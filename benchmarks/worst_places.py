@@ -1,7 +1,7 @@
 """Draw the places where a built graph and the reference disagree most.
 
-Usage: python benchmarks/segmenters.py SETS --names boston --segmenters gnss-vision --workspaces WORKSPACES
-       python benchmarks/worst_places.py SETS/boston WORKSPACES/boston-aligned-gnss-vision docs/img/worst-boston.png
+Usage: probe2road benchmark run SETS --output TABLES --work WORK --poses modelled --name boston --method probe2road
+       python benchmarks/worst_places.py SETS/boston WORK/boston-modelled/probe2road/stages docs/img/worst-boston.png
 
 Every point on either graph, 5 m apart, that is farther than 6 m from the other graph counts for its square of 200 m.
 The squares with most of them are drawn: the probability on the left, and the graph (orange; red dots are dead ends,
