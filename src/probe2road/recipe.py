@@ -29,7 +29,7 @@ from probe2road.skeleton import METHODS, Method, skeletonize_windows
 from probe2road.vectorize import VectorizeOptions, vectorize
 from probe2road.workspace import Progress, Workspace, open_workspace, silent
 
-__all__ = ["SEGMENTERS", "BuildOptions", "Progress", "build", "draw_stages"]
+__all__ = ["SEGMENTERS", "BuildOptions", "Progress", "Segmentation", "build", "draw_stages"]
 
 logger = logging.getLogger(__name__)
 
@@ -58,12 +58,22 @@ class BuildOptions:
         if self.thinning not in METHODS:
             raise OptionError(f"there is no thinning {self.thinning!r}", fix=f"use {' or '.join(METHODS)}")
 
-    @property
-    def segmentation(self) -> BuildOptions:
-        """Return the options with all that is settled after the segmentation at its default."""
-        network = replace(self.network, threshold=None, seed_threshold=None)
-        chosen = {name: getattr(self, name) for name in ("resolution", "segmenter", "gaps", "density")}
-        return BuildOptions(network=network, **chosen)
+
+@dataclass(frozen=True)
+class Segmentation:
+    """What the probability depends on, out of the build options."""
+
+    resolution: float
+    segmenter: str
+    gaps: TraceGaps
+    network: NetworkOptions
+    density: DensityOptions
+
+    @classmethod
+    def of(cls, options: BuildOptions) -> Segmentation:
+        """Take what counts; the thresholds of the network come after the probability."""
+        network = replace(options.network, threshold=None, seed_threshold=None)
+        return cls(options.resolution, options.segmenter, options.gaps, network, options.density)
 
 
 def build(
@@ -121,7 +131,7 @@ def build(
     learned = options.segmenter == "network"
     weights = find_weights(fleet, options.network) if learned else None
     digest = weights.digest if weights else None
-    work = open_workspace(workspace, fleet, options, weights=digest, first=options.segmentation)
+    work = open_workspace(workspace, fleet, options, weights=digest, first=Segmentation.of(options))
     if (graph := work.read_graph("7-roads")) is not None:
         return graph
 

@@ -13,6 +13,7 @@ from probe2road.comparison.cells import build_cell, score_cells
 from probe2road.comparison.measured import Measured
 from probe2road.comparison.source import Source
 from probe2road.errors import InputError, OptionError
+from probe2road.recipe import Segmentation
 
 NAME = "interchange-diamond-1"
 LOSS = {"geo_f1": 0.9, "itopo_f1": 0.7, "soft_f1": 0.8, "steps": 600}
@@ -117,7 +118,7 @@ def test_every_variant_has_a_folder_of_its_own_and_differs_from_the_base_in_one_
         assert len(places) == len(ablation.variants) - shared
         for variant in ablation.variants:
             if variant.like is not None:
-                assert variant.method.options.segmentation == variant.like.options.segmentation
+                assert Segmentation.of(variant.method.options) == Segmentation.of(variant.like.options)
                 assert variant.source == source
         assert ablation.default in [variant.label for variant in ablation.variants]
 
