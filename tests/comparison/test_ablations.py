@@ -44,21 +44,10 @@ def test_the_command_writes_a_page_cells_and_figures(sets, work, tmp_path, monke
     output = tmp_path / "page"
     output.mkdir()
     (output / "notes.toml").write_text('thinning = "Both are alike."')
-    words = [
-        "benchmark",
-        "ablate",
-        sets,
-        "--output",
-        output,
-        "--name",
-        NAME,
-        "--only",
-        "thinning, traces",
-        "--work",
-        work,
-    ]
+    words = ["benchmark", "ablate", sets, "--output", output, "--name", NAME, "--work", work, "--poses", "modelled"]
+    words += ["--only", "thinning", "--only", "traces", "--trainings", tmp_path / "exp.json", "--quiet"]
     with pytest.raises(SystemExit) as done:
-        main([*map(str, words), "--poses", "modelled", "--trainings", str(tmp_path / "exp.json"), "--quiet"])
+        main([str(word) for word in words])
     assert done.value.code in (None, 0)
 
     text = (output / "index.md").read_text()
