@@ -6,11 +6,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from probe2road.errors import CRSError, OptionError
 from probe2road.metrics import HE_BALAKRISHNAN_2022, GeoOptions, comparable, geo, scores_table
 from probe2road.metrics.geo import geo_networks, geo_samples
-from probe2road.metrics.matching import Matching
+from probe2road.metrics.matching import Matching, match_one_to_one
 from probe2road.metrics.network import network_from_graph
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import sample_edges
@@ -213,3 +215,17 @@ def test_an_empty_network_has_no_samples(empty_side: int, streets: Streets) -> N
     assert not samples.proposal_matched.any()
     assert not samples.reference_matched.any()
     assert [samples.proposal_xy, samples.reference_xy][empty_side].shape == (0, 2)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_optimal_matching_has_as_many_pairs_as_scipy_finds(seed):
+    rng = np.random.default_rng(seed)
+    shape = tuple(int(size) for size in rng.integers(1, 40, 2))
+    linked = np.unique(rng.integers(0, shape[0] * shape[1], int(rng.integers(0, 120))))
+    a, b = linked // shape[1], linked % shape[1]
+    partner = match_one_to_one((a, b, np.zeros(len(a))), shape, how="optimal")
+    matched = np.flatnonzero(partner >= 0)
+    assert {(k, int(partner[k])) for k in matched} <= set(zip(a.tolist(), b.tolist(), strict=True))
+    assert len(set(partner[matched])) == len(matched)
+    links = csr_array((np.ones(len(a)), (a, b)), shape=shape)
+    assert len(matched) == (maximum_bipartite_matching(links, perm_type="column") >= 0).sum()

@@ -7,8 +7,6 @@ from typing import Literal
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import maximum_bipartite_matching
 from scipy.spatial import cKDTree
 
 from probe2road.errors import OptionError
@@ -93,7 +91,7 @@ def match_one_to_one(
         How many points there are, ``(A, B)``.
     how
         ``greedy``: each ``a`` in its order takes its nearest free ``b`` (METHOD 6.1 b). ``global``: the nearest
-        of all pairs first (METHOD 6.1 a). ``optimal``: as many pairs as possible (Hopcroft and Karp).
+        of all pairs first (METHOD 6.1 a). ``optimal``: as many pairs as possible.
 
     Returns
     -------
@@ -115,10 +113,9 @@ def match_one_to_one(
     """
     a, b, distance = pairs
     if how == "optimal":
-        if len(a) == 0:
-            return np.full(shape[0], -1, np.int64)
-        graph = csr_array((np.ones(len(a), np.int8), (a, b)), shape=shape)
-        return maximum_bipartite_matching(graph, perm_type="column").astype(np.int64)
+        order = np.argsort(a, kind="stable")
+        first = np.concatenate([[0], np.cumsum(np.bincount(a, minlength=shape[0]))]).astype(np.int64)
+        return _most_pairs(first, b[order], shape[1])
     if how == "global":
         order = np.lexsort((b, a, distance))
         a, b = a[order], b[order]
@@ -136,4 +133,38 @@ def _take_in_order(a: NDArray[np.int64], b: NDArray[np.int64], n_a: int, n_b: in
         if partner[a[pair]] < 0 and not used[b[pair]]:
             partner[a[pair]] = b[pair]
             used[b[pair]] = True
+    return partner
+
+
+@njit(cache=True)
+def _most_pairs(first: NDArray[np.int64], b: NDArray[np.int64], n_b: int) -> NDArray[np.int64]:
+    """Match as many points as possible: every ``a`` in turn takes a free partner, or one whose owner can take another.
+
+    The search for such a chain stays among the points that are linked to each other. Those are few, which is why this
+    is fast where a general program, which goes over all points in each of its rounds, can take minutes.
+    """
+    n_a = len(first) - 1
+    partner, owner = np.full(n_a, -1, np.int64), np.full(n_b, -1, np.int64)
+    seen = np.full(n_b, -1, np.int64)  # the last root that came by
+    chain, over, at = np.empty(n_a, np.int64), np.empty(n_a, np.int64), first[:-1].copy()
+    for root in range(n_a):
+        depth = 0
+        chain[0], at[root] = root, first[root]
+        while depth >= 0:
+            here = chain[depth]
+            if at[here] == first[here + 1]:
+                depth -= 1
+                continue
+            target = b[at[here]]
+            at[here] += 1
+            if seen[target] == root:
+                continue
+            seen[target], over[depth] = root, target
+            if owner[target] < 0:
+                for step in range(depth + 1):
+                    partner[chain[step]], owner[over[step]] = over[step], chain[step]
+                break
+            depth += 1
+            chain[depth] = owner[target]
+            at[chain[depth]] = first[chain[depth]]
     return partner
