@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from probe2road.errors import OutputError
 from probe2road.export import write_graph
 from probe2road.fleet import Fleet
+from probe2road.io.atomic import make_folder
 from probe2road.io.fleet_reader import read_fleet_files
 from probe2road.io.fleet_writer import write_fleet
 from probe2road.metrics import evaluate
@@ -70,10 +70,7 @@ def run_demo(folder: str | Path, *, progress: Progress | None = None) -> tuple[d
         If the folder cannot be created.
     """
     folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot be created ({error.strerror})", where=folder) from error
+    make_folder(folder)
     simulated = _simulated(200, 1)
     drives, roads, truth = (folder / name for name in ("drives.parquet", "roads.gpkg", "true-roads.gpkg"))
     write_fleet(simulated.fleet, drives)

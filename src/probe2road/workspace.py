@@ -25,7 +25,7 @@ from probe2road.errors import OutputError
 from probe2road.export import read_graph, write_graph
 from probe2road.fleet import Fleet
 from probe2road.grid import Grid, read_raster, write_raster
-from probe2road.io.atomic import atomic_path
+from probe2road.io.atomic import atomic_path, make_folder
 from probe2road.roadgraph import RoadGraph
 
 if TYPE_CHECKING:
@@ -148,10 +148,7 @@ def open_workspace(
     mark = {"format": _FORMAT, "fleet": fingerprint(fleet), "weights": weights}
     mark |= {"options": asdict(options), "first": asdict(first or options)}
     mark = json.loads(json.dumps(mark))  # tuples become lists, as they are in a file
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot be created ({error.strerror})", where=folder) from error
+    make_folder(folder)
     path = folder / _MARK
     if not path.exists() and any(folder.iterdir()):
         raise OutputError("the folder is not empty and not a workspace", where=folder, fix="name an empty folder")

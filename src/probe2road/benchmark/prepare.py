@@ -18,8 +18,8 @@ from probe2road.benchmark.datasets import OSM_NOTICE, Dataset, find_datasets, lo
 from probe2road.benchmark.recording import Recording, record_fleet
 from probe2road.benchmark.residual import ResidualModel
 from probe2road.benchmark.tiles import motorway_tiles, split_tiles
-from probe2road.errors import InputError, OutputError
-from probe2road.io.atomic import atomic_path
+from probe2road.errors import InputError
+from probe2road.io.atomic import atomic_path, make_folder
 from probe2road.recipe import Progress
 from probe2road.simulate.network import RoadNetwork
 
@@ -73,10 +73,7 @@ def prepare(
     """
     chosen = find_datasets(list(names))
     output = Path(output)
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot be created ({error.strerror})", where=output) from error
+    make_folder(output)
     folders = []
     for number, definition in enumerate(chosen, start=1):
         logger.info("data set %s (%d of %d): %s", definition.name, number, len(chosen), definition.role)

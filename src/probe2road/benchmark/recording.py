@@ -26,7 +26,7 @@ import shapely
 from probe2road.benchmark.residual import ResidualModel, align_drives
 from probe2road.errors import OptionError, OutputError
 from probe2road.export import write_graph
-from probe2road.io.atomic import atomic_path
+from probe2road.io.atomic import atomic_path, make_folder
 from probe2road.io.fleet_writer import ROW_GROUP, bounding_box, point_table, with_geo
 from probe2road.recipe import Progress
 from probe2road.roadgraph import RoadGraph
@@ -187,10 +187,7 @@ def record_fleet(
 
 def _open(folder: Path, run: Mapping[str, Any]) -> Path | None:
     """Prepare the folder: where the portions go, or None if this very recording is there already."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot be created ({error.strerror})", where=folder) from error
+    make_folder(folder)
     done, portions = folder / RUN_FILE, folder / _PORTIONS
     mark = portions / RUN_FILE
     if done.exists():

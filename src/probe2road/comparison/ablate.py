@@ -16,8 +16,8 @@ from probe2road.comparison.figures import Point, draw_points
 from probe2road.comparison.intervals import DRAWS, Interval, f1_interval
 from probe2road.comparison.source import Source
 from probe2road.comparison.tables import ablation_table, markdown_table
-from probe2road.errors import InputError, OutputError
-from probe2road.io.atomic import atomic_path
+from probe2road.errors import InputError
+from probe2road.io.atomic import atomic_path, make_folder
 from probe2road.workspace import Progress, silent
 
 __all__ = ["run_ablations"]
@@ -89,10 +89,7 @@ def run_ablations(
     _ = source.digest  # says what is missing before hours of work
     losses = {} if trainings is None else _read_losses(Path(trainings))
     notes = _read_notes(output / _NOTES)
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot be created ({error.strerror})", where=output) from error
+    make_folder(output)
 
     if losses:
         draw_points(

@@ -20,8 +20,7 @@ from probe2road.comparison.tables import (
     stages_table,
     vision_table,
 )
-from probe2road.errors import OutputError
-from probe2road.io.atomic import atomic_path
+from probe2road.io.atomic import atomic_path, make_folder
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.workspace import Progress, silent
 
@@ -94,10 +93,7 @@ def run_benchmark(
     sources = [Source(Path(sets) / find_dataset(name).name, work, poses) for name in names]
     for source in sources:
         _ = source.digest  # says what is missing before hours of work
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot be created ({error.strerror})", where=output) from error
+    make_folder(output)
 
     cells: list[Cell] = []
     for number, source in enumerate(sources):

@@ -8,7 +8,7 @@ from probe2road.comparison.cells import FULL, Cell
 from probe2road.comparison.intervals import Interval, difference_interval, f1_interval
 from probe2road.comparison.methods import METHODS
 from probe2road.comparison.published import METHODS_TABLE, SOFT_F1_TABLE, STAGES_TABLE, VISION_TABLE, Triple
-from probe2road.metrics.scores import f_score, ratio
+from probe2road.metrics.scores import ratio
 
 __all__ = [
     "ablation_table",
@@ -146,8 +146,7 @@ def _triple(cell: Cell, metric: str, *, digits: int = 3) -> list[str]:
     precision = ratio(sums["matched_proposal"], sums["proposal"])
     recall = ratio(sums["matched_reference"], sums["reference"])
     interval = f1_interval(cell.tiles[metric])
-    f1 = Interval(f_score(precision, recall), interval.low, interval.high)
-    return [f"{precision:.{digits}f}", f"{recall:.{digits}f}", _with_interval(f1, digits=digits)]
+    return [f"{precision:.{digits}f}", f"{recall:.{digits}f}", _with_interval(interval, digits=digits)]
 
 
 def _with_interval(interval: Interval, *, sign: str = "", digits: int = 3) -> str:

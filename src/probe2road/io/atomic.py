@@ -11,7 +11,7 @@ from pathlib import Path
 
 from probe2road.errors import OutputError
 
-__all__ = ["atomic_path"]
+__all__ = ["atomic_path", "make_folder"]
 
 
 @contextmanager
@@ -87,3 +87,17 @@ def _move(workshop: Path, target: Path) -> None:
     except OSError:
         aside.replace(target)
         raise
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder that output goes to, and those above it; one that is there stays as it is.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be created.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot be created ({error.strerror})", where=path) from error
