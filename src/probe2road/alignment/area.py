@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from probe2road.alignment.floors import Floors, find_floors, floor_of, registered_heights
+from probe2road.alignment.floors import Floors, find_floors, floor_of
 from probe2road.alignment.graph import optimise
 from probe2road.alignment.heights import solve_heights
 from probe2road.alignment.hypotheses import Track
@@ -20,6 +20,7 @@ from probe2road.alignment.lines import Condensed, Matches, condense, match_lines
 from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.profiles import ShiftSearch
 from probe2road.alignment.registration import Chains, Evidence, register
+from probe2road.alignment.routes import route_heights
 from probe2road.alignment.spines import CELL, OnSpines, Spines, find_spines, project
 from probe2road.fleet import Fleet
 
@@ -157,7 +158,7 @@ def _register(
     """Bring drives onto one another, first in height, then across the road: poses, floors, heights over the spines."""
     frames, options = scene.frames, scene.options
     on = project(spines, pose, options)
-    height = registered_heights(frames, on, spines, scene.chains, options)
+    height = route_heights(frames, on, spines, options, held=scene.held)
     floors = find_floors(on, height, spines, options)
     home = floor_of(floors, on.cell, height, options)
     if len(scene.seen.keyframe) == 0 or len(floors.cell) == 0:

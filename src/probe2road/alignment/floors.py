@@ -2,11 +2,9 @@
 
 Strategy
 --------
-Raw heights are off by metres, as much as two decks of a bridge are apart, but their errors change slowly. So heights
-are first registered like lateral positions, drive after drive, with a weight so small that agreement with another
-drive never outweighs several metres of GNSS height: a drive on a deck of its own stays there. Then the heights at each
-place fall into groups with a gap between them, and every group is a floor. All later stages work on floors; a spine
-with two decks has two at each of its cells.
+Raw heights are off by metres, as much as two decks of a bridge are apart. Once drives that surely are on one road
+agree on its height (`probe2road.alignment.routes`), the heights at each place fall into groups with a gap between them,
+and every group is a floor. All later stages work on floors; a spine with two decks has two at each of its cells.
 """
 
 from __future__ import annotations
@@ -16,17 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from probe2road.alignment.hypotheses import Track
-from probe2road.alignment.keyframes import Keyframes
 from probe2road.alignment.options import AlignOptions
-from probe2road.alignment.profiles import Places, ShiftSearch
-from probe2road.alignment.registration import Chains, Evidence, register
+from probe2road.alignment.profiles import Places
 from probe2road.alignment.spines import OnSpines, Spines
 
-__all__ = ["VERTICAL", "Floors", "find_floors", "floor_of", "registered_heights"]
+__all__ = ["Floors", "find_floors", "floor_of"]
 
-VERTICAL = 1.6  # vertical over horizontal error of GNSS under open sky
-_PERSUASION = 5.0  # weight of all heights that a drive shares with others, in observations
 _LOOK_AHEAD = 4  # cells ahead of a keyframe in which it sees things, and one behind
 _FAR = 10_000.0  # m, more than any height
 
@@ -44,34 +37,6 @@ class Floors:
         """Floor that stands for each floor and the next: shape ``(f,)``."""
         own = np.arange(len(self.cell))
         return np.where((self.cell % 2 == 1) & (self.places.before >= 0), self.places.before, own)
-
-
-def registered_heights(
-    frames: Keyframes,
-    on: OnSpines,
-    spines: Spines,
-    chains: Chains,
-    options: AlignOptions,
-) -> NDArray[np.float64]:
-    """Height of every keyframe above its spine, m, drives brought together; NaN where it is not known.
-
-    Where no drive has heights all are 0.
-    """
-    if not np.isfinite(frames.z).any():
-        return np.zeros(len(frames.z))
-    raw = np.where(on.station >= 0, frames.z - spines.z[np.maximum(on.station, 0)], np.nan)
-    known = np.flatnonzero(np.isfinite(raw))
-    kind = np.zeros(len(known), np.int8)
-    persuasion = _PERSUASION * options.keyframe_spacing / options.gnss_length
-    length = np.diff(frames.distance, prepend=frames.distance[:1])
-    track = Track(
-        on.cell, np.nan_to_num(raw), np.zeros(len(raw)), np.maximum(options.height_share * length, 0.1),
-        VERTICAL * frames.sigma * frames.inflation(options),
-    )  # fmt: skip
-    search = ShiftSearch(options.height_search, 0.5, 3.0 * options.height_search, 0.7, 0.7, persuasion, novelty=0.0)
-    seen = Evidence(known, on.cell[known], raw[known], kind)
-    shift = register(seen, Places.from_roads(spines.cell_spine), chains, track, search)
-    return raw + shift
 
 
 def find_floors(on: OnSpines, height: NDArray[np.float64], spines: Spines, options: AlignOptions) -> Floors:

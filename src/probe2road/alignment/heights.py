@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 
-from probe2road.alignment.floors import VERTICAL
 from probe2road.alignment.keyframes import Keyframes
 from probe2road.alignment.options import AlignOptions
 
-__all__ = ["solve_heights"]
+__all__ = ["VERTICAL", "solve_heights"]
 
+VERTICAL = 1.6  # vertical over horizontal error of GNSS under open sky
 _FLOOR_SIGMA = 0.2  # m, of a keyframe about its floor
 _CHANGE_SIGMA = 0.05  # m, of the change of height between keyframes, however short
 _KERNEL = 2.0  # sigmas of one fix beyond which GNSS counts less (Cauchy)
@@ -40,7 +40,7 @@ def solve_heights(
     frames
         Keyframes with recorded heights.
     floor
-        Of each keyframe, -1 where it has none: shape ``(k,)``.
+        Of each keyframe, or any other place whose keyframes have one height; -1 where it has none: shape ``(k,)``.
     ground
         Height of the spine at each keyframe, m, shape ``(k,)``.
     options

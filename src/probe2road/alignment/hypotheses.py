@@ -24,6 +24,7 @@ __all__ = ["Track", "best_path", "gnss_scores", "own_rates", "sight_scores"]
 
 _OUTLIERS = 0.05  # least rate of anything anywhere, as a share of the average
 _OWN_WINDOW = 8  # keyframes before and after that say what a drive sees all along
+_NOVELTY = 0.95  # weight of what the drive itself saw, against the average, where nobody could see yet
 _OWN_DOUBT = 0.3  # keyframes whose average view they are mixed with
 
 
@@ -146,7 +147,7 @@ def own_rates(
             others_seen, others_could = _around(seen[:, which, b]), _around(could[:, which, b])
             for i in range(end - begin):
                 own_rate = (max(others_seen[i], 0.0) + doubt) / (max(others_could[i], 0.0) + doubt)
-                rates[i, which, b] = search.novelty * own_rate + 1.0 - search.novelty
+                rates[i, which, b] = _NOVELTY * own_rate + 1.0 - _NOVELTY
     return rates
 
 

@@ -22,7 +22,6 @@ class AlignOptions:
     altitude_gate: float = 3.0  # m; nor do roads that lie further apart in height
     reach: float = 12.0  # m, lateral; drives nearer than this may be on one carriageway
     search: float = 9.0  # m, lateral shift within which a drive is looked for on the others
-    height_search: float = 8.0  # m, the same for its height
     first_gate: float = 1.5  # m, from a point to its line, in the first round; registration has been before
     last_gate: float = 0.7  # m, to which it shrinks
     rounds: int = 6  # of matching and optimising, at most

@@ -48,7 +48,6 @@ class ShiftSearch(NamedTuple):
     kernel: float  # m, 1 sigma, by which a vote is spread
     doubt: float  # keyframes that must have looked at a place before what they saw counts half
     temper: float  # weight of one observation; below 1, because neighbouring ones share errors
-    novelty: float = 0.95  # weight of what the drive itself saw, against the average, where nobody could see yet
 
 
 class Sights(NamedTuple):

@@ -12,8 +12,6 @@ programming. When all are placed, each is taken out and placed again, so that th
 Drives that agree already are settled: all are on the map from the start, and each is only taken out and placed once.
 Placing them anew, one after the other, would let two of them lock beside the road that all others agree on: what one
 saw there alone fits what the other saw as well as anything.
-
-The same procedure registers heights, where the profile is one of heights and the thing seen is the road itself.
 """
 
 from __future__ import annotations
