@@ -6,21 +6,21 @@ import json
 import logging
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from probe2road.cli_benchmark import benchmark
 from probe2road.errors import OptionError, OutputError, Probe2RoadError
+from probe2road.progress_bar import progress_bar
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from probe2road.fleet import Fleet
-    from probe2road.recipe import Progress
     from probe2road.segmentation.network import NetworkOptions
 
 __all__ = ["app", "main"]
@@ -37,8 +37,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-_benchmark = typer.Typer(name="benchmark", help="The open benchmark.", no_args_is_help=True)
-app.add_typer(_benchmark)
+app.add_typer(benchmark)
 
 # Options that several verbs share.
 Columns = Annotated[
@@ -118,7 +117,7 @@ def build(
 
     fleet = _read_fleet(traces, points, columns, point_columns, crs, bbox, delimiter, no_header, work_crs)
     workspace = keep_intermediate or output[0].parent / f".{output[0].name}.probe2road"
-    with _progress_bar() as progress:
+    with progress_bar() as progress:
         graph = build_graph(fleet, options, workspace=workspace, progress=progress)
     for path in output:
         write_graph(graph, path)
@@ -162,7 +161,7 @@ def align(
     work_crs = base.crs.to_wkt() if base else None
     fleet = _read_fleet(traces, points, columns, point_columns, crs, bbox, delimiter, no_header, work_crs)
     workspace = output.parent / f".{output.name}.probe2road"
-    with _progress_bar() as progress:
+    with progress_bar() as progress:
         kept: dict[str, Any] = {"workspace": workspace, "workers": workers, "progress": progress}
         result = add_drives(base, fleet, options, **kept) if base else align_fleet(fleet, options, **kept)
     write_fleet(result.fleet, output)
@@ -295,7 +294,7 @@ def demo(
     """Run the main job on a simulated cloverleaf, offline, and say which files to open."""
     from probe2road.demo import run_demo
 
-    with _progress_bar() as progress:
+    with progress_bar() as progress:
         files, scores = run_demo(folder, progress=progress)
     _print_scores(scores)
     typer.echo("\nOpen these:")
@@ -326,7 +325,7 @@ def simulate(
     if (drives is None) == (kilometres is None):
         raise OptionError("the amount must be given once", where="simulate", fix="pass --drives or --kilometres")
     chosen = find_preset(preset)
-    with _progress_bar() as progress:
+    with progress_bar() as progress:
         record_fleet(
             read_network(network),
             output,
@@ -362,93 +361,13 @@ def train(
     if threads is not None:
         use_threads(threads)
     stop_after = None if minutes is None else 60.0 * minutes
-    with _progress_bar() as progress:
+    with progress_bar() as progress:
         state = run_training(chosen, output, sets=sets, device=device, stop_after=stop_after, progress=progress)
     if not is_first():
         return
     if state.step < chosen.steps:
         typer.echo(f"stopped after step {state.step} of {chosen.steps}; start again to go on")
     typer.echo(export_best(chosen, state, output, sets=sets))
-
-
-@_benchmark.command()
-def prepare(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder that gets a folder for each data set.")],
-    names: Annotated[
-        list[str] | None, typer.Argument(help="Data sets, NAME-PRESET, or groups; all cities without any.")
-    ] = None,
-    data: Annotated[Path, typer.Option(help="Folder of the OpenStreetMap extracts.")] = Path("../shared/data/osm"),
-    workers: Annotated[int, typer.Option(help="Processes; no influence on the result.")] = 1,
-) -> None:
-    """Make data sets of the open benchmark: simulated fleets on real roads, with the truth and fixed splits.
-
-    An interrupted run goes on where it stopped when it is started again.
-    """
-    from probe2road.benchmark.prepare import prepare as prepare_datasets
-
-    with _progress_bar() as progress:
-        for folder in prepare_datasets(names or [], output, data=data, workers=workers, progress=progress):
-            typer.echo(folder)
-
-
-@_benchmark.command()
-def run(
-    sets: Annotated[Path, typer.Argument(help="Folder of prepared data sets.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for tables, cells and pictures.")],
-    names: Annotated[list[str] | None, typer.Option("--name", help="Data set; may be repeated.")] = None,
-    methods: Annotated[list[str] | None, typer.Option("--method", help="Method; may be repeated.")] = None,
-    work: Annotated[Path | None, typer.Option(help="Folder that keeps graphs and scores.")] = None,
-    poses: Annotated[str, typer.Option(help="aligned (by align), modelled (as after an alignment), raw.")] = "aligned",
-    deepmg: Annotated[Path | None, typer.Option(help="Weights of DeepMG; left out without them.")] = None,
-) -> None:
-    """Build and score every method on every data set, and write the paper's tables.
-
-    An interrupted run goes on where it stopped when it is started again.
-    """
-    from probe2road.comparison.run import CITIES, run_benchmark
-
-    with _progress_bar() as progress:
-        run_benchmark(
-            sets,
-            output,
-            names=names or CITIES,
-            methods=methods or (),
-            work=work,
-            poses=poses,
-            deepmg=deepmg,
-            progress=progress,
-        )
-    typer.echo(output / "index.md")
-
-
-@_benchmark.command()
-def ablate(
-    sets: Annotated[Path, typer.Argument(help="Folder of prepared data sets.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for page, cells and figures.")],
-    name: Annotated[str, typer.Option(help="Data set.")] = "milan",
-    only: Annotated[list[str] | None, typer.Option(help="Ablation; may be repeated; all without it.")] = None,
-    work: Annotated[Path | None, typer.Option(help="Folder that keeps graphs and scores.")] = None,
-    poses: Annotated[str, typer.Option(help="aligned (by align), modelled (as after an alignment), raw.")] = "aligned",
-    trainings: Annotated[Path | None, typer.Option(help="JSON of training experiments, to compare losses.")] = None,
-) -> None:
-    """Change one thing of the default at a time, score it, and draw a figure for each.
-
-    An interrupted run goes on where it stopped when it is started again.
-    """
-    from probe2road.comparison.ablate import run_ablations
-
-    with _progress_bar() as progress:
-        run_ablations(
-            sets,
-            output,
-            name=name,
-            only=only or (),
-            work=work,
-            poses=poses,
-            trainings=trainings,
-            progress=progress,
-        )
-    typer.echo(output / "index.md")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -522,26 +441,6 @@ def _numbers(text: str, option: str) -> tuple[float, float, float, float]:
     except ValueError as error:
         raise OptionError(f"{text!r} is not left,bottom,right,top", where=option) from error
     return left, bottom, right, top
-
-
-@contextmanager
-def _progress_bar() -> Iterator[Progress]:
-    """Show how far the current stage is, on standard error and only on a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
-
-    console = Console(stderr=True)
-    parts: list[Any] = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
-    with Bar(*parts, console=console, transient=True, disable=not console.is_terminal) as bar:
-        tasks: dict[str, Any] = {}
-
-        def report(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done, total=total)
-
-        yield report
 
 
 def _print_scores(scores: pd.DataFrame) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -103,7 +105,10 @@ def validate(
         raise InputError("there are no squares to validate on", where="validation", fix="name a source with roads")
     masks = [threshold_mask(probability, threshold=threshold) for probability in probabilities]
     soft = soft_f1(masks, [part.label for part in squares])
-    graphs = [clean_graph(vectorize(skeletonize(mask), part.grid)) for mask, part in zip(masks, squares, strict=True)]
+    with _quiet():
+        graphs = [
+            clean_graph(vectorize(skeletonize(mask), part.grid)) for mask, part in zip(masks, squares, strict=True)
+        ]
     place, ways = (
         _pooled([metric(graph, part.reference) for graph, part in zip(graphs, squares, strict=True)])
         for metric in (geo, itopo)
@@ -112,6 +117,18 @@ def validate(
         "score": (soft.f1 + place.f1) / 2, "soft_f1": soft.f1,
         "geo_f1": place.f1, "geo_precision": place.precision, "geo_recall": place.recall, "itopo_f1": ways.f1,
     }  # fmt: skip
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what building these graphs has to say out of the log of a training."""
+    logger = logging.getLogger("probe2road")
+    level = logger.level
+    logger.setLevel(max(level, logging.WARNING))
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _places(scene: Scene, options: ValidationOptions) -> NDArray[np.float64]:
