@@ -213,8 +213,13 @@ def _results(
             yield tile, moves, seen
     if len(missing) < len(tiles):
         logger.info("taking %d of %d tiles from an earlier run", len(tiles) - len(missing), len(tiles))
+    xy = fleet.traces[["x", "y"]].to_numpy(np.float64)
     point_rows = rows_of_points(fleet)
-    jobs = ((tile, *_cut(fleet, usable, held, point_rows, tile), options) for tile in missing)
+    squares = (
+        _Squares.of(xy, np.flatnonzero(usable), options.tile),
+        _Squares.of(xy[point_rows], np.flatnonzero(np.append(usable, False)[point_rows]), options.tile),
+    )
+    jobs = ((tile, *_cut(fleet, held, point_rows, squares, tile), options) for tile in missing)
     made = (_align_tile(*job) for job in jobs) if workers == 1 else in_processes(_align_tile, jobs, workers)
     for tile, (moves, seen) in zip(missing, made, strict=True):
         workspace.write_array(f"{tile.name}-residuals", seen)
@@ -222,16 +227,52 @@ def _results(
         yield tile, moves, seen
 
 
+@dataclass(frozen=True)
+class _Squares:
+    """Rows by the square of the plane that they are in, so that a tile is cut without a pass over all of them."""
+
+    size: float  # m
+    rows: dict[tuple[int, int], NDArray[np.int64]]
+
+    @classmethod
+    def of(cls, xy: NDArray[np.float64], rows: NDArray[np.int64], size: float) -> _Squares:
+        """Sort some rows of positions, shape ``(n, 2)``."""
+        column, row = np.floor(xy[rows] / size).astype(np.int64).T
+        order = np.lexsort((row, column))
+        ends = np.flatnonzero((np.diff(column[order]) != 0) | (np.diff(row[order]) != 0)) + 1
+        parts = np.split(order, ends) if len(order) else []
+        return cls(size, {(int(column[part[0]]), int(row[part[0]])): rows[part] for part in parts})
+
+    def touching(self, box: tuple[float, float, float, float]) -> NDArray[np.int64]:
+        """Rows of all squares that a box reaches into, ascending."""
+        left, bottom, right, top = (int(np.floor(edge / self.size)) for edge in box)
+        places = ((column, row) for column in range(left, right + 1) for row in range(bottom, top + 1))
+        parts = [self.rows[place] for place in places if place in self.rows]
+        return np.sort(np.concatenate(parts)) if parts else np.zeros(0, np.int64)
+
+
 def _cut(
-    fleet: Fleet, usable: NDArray[np.bool_], held: NDArray[np.bool_], point_rows: NDArray[np.int64], tile: Tile
+    fleet: Fleet,
+    held: NDArray[np.bool_],
+    point_rows: NDArray[np.int64],
+    squares: tuple[_Squares, _Squares],
+    tile: Tile,
 ) -> tuple[Fleet, NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the part of a fleet inside a tile and its margin, the rows it has, and which of its drives are held."""
+    """Return the part of a fleet inside a tile and its margin, the rows it has, and which of its drives are held.
+
+    The squares are those of the usable fixes and of the points seen from them.
+    """
     left, bottom, right, top = tile.box
     x, y = (fleet.traces[axis].to_numpy() for axis in "xy")
-    inside = usable & (x >= left) & (x < right) & (y >= bottom) & (y < top)
-    rows = np.flatnonzero(inside)
-    seen = np.append(inside, False)[point_rows]
-    part = Fleet(fleet.traces.iloc[rows].reset_index(drop=True), fleet.points[seen].reset_index(drop=True), fleet.crs)
+
+    def inside(rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return (x[rows] >= left) & (x[rows] < right) & (y[rows] >= bottom) & (y[rows] < top)
+
+    fixes, points = (part.touching(tile.box) for part in squares)
+    rows, seen = fixes[inside(fixes)], points[inside(point_rows[points])]
+    part = Fleet(
+        fleet.traces.iloc[rows].reset_index(drop=True), fleet.points.iloc[seen].reset_index(drop=True), fleet.crs
+    )
     owner = np.searchsorted(fleet.starts, rows[part.starts[:-1]], side="right") - 1
     return part, rows, held[owner]
 
