@@ -224,6 +224,13 @@ class TestArtefacts:
     def test_traces_that_coincide_prove_a_real_road(self) -> None:
         assert len(split_false_junctions(FLAT, self.crossing, positions=apart(self.crossing, 2.0)).edges) == 5
 
+    @pytest.mark.parametrize(("height", "edges"), [(6.0, 2), (3.0, 5)])
+    def test_traces_that_coincide_in_plan_part_by_height(self, height: float, edges: int) -> None:
+        positions = apart(self.crossing, 1.0)
+        upper = positions["trace_id"].map(self.crossing.groupby("trace_id")["edge"].first()) == 1
+        stacked = positions.assign(z=np.where(upper, height, 0.0))
+        assert len(split_false_junctions(FLAT, self.crossing, positions=stacked).edges) == edges
+
     def test_roads_that_touch_but_do_not_cross_part_too(self) -> None:
         steps = steps_of(FLAT, {(0, 4, 2): 4, (1, 4, 3): 4})
         one, other = split_false_junctions(FLAT, steps, positions=apart(steps)).edges.geometry

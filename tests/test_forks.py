@@ -74,6 +74,20 @@ def test_the_branches_lead_straight_from_there_and_end_as_before() -> None:
     assert result.edges["length"].tolist() == pytest.approx([line.length for line in result.edges.geometry])
 
 
+def test_a_lane_that_leads_to_a_ramp_is_not_the_ramp() -> None:
+    """Those who leave change lanes from 40 m on and have one of their own from 80 m on; the ramp leaves at 120 m."""
+    x = np.arange(2.0, 400.0, 4.0)
+    away = np.interp(x, [40.0, 80.0, 120.0, 400.0], [0.0, -3.5, -3.5, -31.5])
+    tables = [
+        pd.DataFrame({"trace_id": k, "t": np.arange(len(x)), "x": x, "y": away if k % 2 else np.zeros(len(x))})
+        for k in range(12)
+    ]
+    fleet = fleet_from_tables(pd.concat(tables), crs=CRS, target_crs=CRS)
+    graph = graph_from_lines(LATE, crs=CRS)
+    assert fork_of(moved(graph, fleet))[0] == pytest.approx(120.0, abs=8.0)
+    assert fork_of(moved(graph, fleet, max_lane=2.5))[0] < 90.0
+
+
 def test_noise_alone_moves_nothing() -> None:
     # The traces part where the mask has it: before, they differ by noise and lane only.
     graph = graph_from_lines(LATE, crs=CRS)

@@ -75,8 +75,8 @@ def split_false_junctions(
     continues most nearly straight. Where positions are given, it also
 
     * looks at each edge up to ``max_inner`` between two junctions as if it and its nodes were one junction. Where
-      traces use it in two ways that never mix, and are apart at both of its nodes, it is an artefact of roads that
-      cross at a flat angle: it is removed, and both roads are led straight on without a common node;
+      traces use it in two ways that never mix, and are apart at both of its nodes or ``min_height`` above each other,
+      it is an artefact of roads that cross: it is removed, and both roads are led straight on without a common node;
     * uses the heights of the traces. A road with fewer than ``min_count`` passages is split off if its traces are
       ``min_height`` above or below the others, and roads that cross at one level stay connected.
 
@@ -146,8 +146,9 @@ def _guarded(graph: RoadGraph, single: Passages, options: DisambiguateOptions) -
     inner = _possible_artefacts(graph, options.max_inner)
     double, at_ends = double_passages(graph, single, inner)
     around = places_around(graph, inner)
-    outer_group = proven_groups(evidence(around, double), directions, rules)
-    removed = _artefacts(graph, around, outer_group, double, at_ends, options.min_apart)
+    found = evidence(around, double)
+    outer_group = proven_groups(found, directions, rules)
+    removed = _artefacts(graph, around, outer_group, double, at_ends, found.spread, options)
 
     # What is one artefact is not also split node by node.
     ends = graph.edges[["u", "v"]].to_numpy()[removed].ravel()
@@ -177,14 +178,18 @@ def _artefacts(
     group: NDArray[np.int64],
     double: Passages,
     at_ends: NDArray[np.float64],
-    min_apart: float,
+    spread: float,
+    options: DisambiguateOptions,
 ) -> NDArray[np.int64]:
     """Rows of edges that traces of two groups of ends pass over, apart; of two that share a node, the shorter."""
     over = slice(0, len(at_ends))
     came, went = (group[around.find(double.junction[over], ends[over])] for ends in (double.came, double.went))
-    table = pd.DataFrame(at_ends.reshape(-1, 4)).assign(row=double.junction[over] - len(graph.nodes), group=came)
-    middle = table[came == went].groupby(["row", "group"]).median()
-    found = [row for row, places in middle.groupby(level="row") if _are_apart(places.to_numpy(), min_apart)]
+    table = pd.DataFrame(at_ends.reshape(-1, 4)).assign(
+        z=double.xyz[over, 2], row=double.junction[over] - len(graph.nodes), group=came
+    )
+    of_group = table[came == went].groupby(["row", "group"])
+    middle = of_group.median().assign(error=spread / np.sqrt(of_group["z"].count()))
+    found = [row for row, groups in middle.groupby(level="row") if _are_apart(groups, options)]
     u, v = graph.edges[["u", "v"]].to_numpy().T
     length = graph.edges["length"].to_numpy()
     centre = shapely.line_interpolate_point(graph.edges.geometry.to_numpy()[found], 0.5, normalized=True)
@@ -198,13 +203,18 @@ def _artefacts(
     return np.array(removed, np.int64)
 
 
-def _are_apart(places: NDArray[np.float64], least: float) -> bool:
-    """Tell whether two groups or more are all apart at both nodes; rows are groups, columns x, y, x, y."""
-    if len(places) < 2:
-        return False
-    one, other = np.triu_indices(len(places), 1)
+def _are_apart(groups: pd.DataFrame, options: DisambiguateOptions) -> bool:
+    """Tell whether two groups or more are apart, each from every other, in plan at both nodes or else in height.
+
+    The columns are x, y, x, y at the nodes, then z and its standard error, m; heights may be unknown.
+    """
+    one, other = np.triu_indices(len(groups), 1)
+    places, z, error = groups.iloc[:, :4].to_numpy(), groups["z"].to_numpy(), groups["error"].to_numpy()
     away = (places[one] - places[other]).reshape(-1, 2, 2)
-    return bool((np.hypot(away[..., 0], away[..., 1]) >= least).all())
+    beside = (np.hypot(away[..., 0], away[..., 1]) >= options.min_apart).all(axis=1)
+    least = np.maximum(options.min_height, options.confidence * np.hypot(error[one], error[other]))
+    above = np.abs(z[one] - z[other]) >= least
+    return len(one) > 0 and bool((beside | above).all())
 
 
 def _turns(before: RoadGraph, after: RoadGraph, passages: Passages) -> pd.DataFrame:

@@ -9,13 +9,19 @@ from there on the distance grows. So for every fork the distance between the med
 along the common road, and a level followed by a straight rise is fitted: the fork belongs where the line bends. All
 bends are tried for all forks at once, each a weighted least-squares fit with two unknowns in closed form.
 
+Where a lane of its own leads to a ramp, traces change to it before the fork, and their distance grows by a lane there
+already. So two rises with a level between them, one lane apart, are fitted as well. Where that explains the distances
+much better, the fork belongs where the level ends.
+
 Legend of array shapes: E edges, F forks, B bins, n fixes. Ends of edges are numbered: 2 row at u, 2 row + 1 at v.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -43,6 +49,9 @@ _FEWEST_BINS = 5
 _ENOUGH = 20  # traces beyond which more make a bin no better
 _KEPT = 10.0  # m that must be left of the common road
 _LEAST = 3.0  # m; moving by less is not worth it
+# Of lanes that lead to a fork, all m: where they end, how long they are, and over what length traces change to them.
+_LANE_ENDS, _LANE_LENGTHS, _LANE_CHANGES = np.arange(0.0, 95.0, 2.5), (10.0, 20.0, 30.0, 45.0, 60.0), (25.0, 45.0, 70.0)
+_LANE_GAIN = 0.5  # of the squared errors of one rise, what must be left with two
 
 
 @dataclass(frozen=True)
@@ -54,11 +63,13 @@ class ForkOptions:
     min_traces: int = 3  # traces that each branch needs at a place
     min_rise: float = 1.5  # m by which traces must have drawn apart where the fork was
     confidence: float = 3.0  # standard errors by which the rise must differ from none
+    min_lane: float = 2.5  # m, of a lane that traces change to before they part
+    max_lane: float = 4.5  # m; a rise that is higher is none to another lane
     rejoin: float = 12.0  # m behind the old place where the branches are as before
 
     def __post_init__(self) -> None:
         """Refuse negative numbers."""
-        for name in ("reach", "max_angle", "min_traces", "min_rise", "confidence", "rejoin"):
+        for name in vars(self):
             if not getattr(self, name) >= 0:
                 fault = f"{name} is {getattr(self, name)}"
                 raise OptionError(fault, where="ForkOptions", fix="use a number that is not negative")
@@ -124,7 +135,8 @@ def move_forks(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: For
     driven, fixes = frame(graph, fleet, matches)
     length = shapely.length(graph.edges.geometry.to_numpy())
     apart, count = _distances(forks, driven, fixes, length, options)
-    shift = _room(forks, _bends(apart, count, options), length)
+    bends = _lane_ends(apart, count, _bends(apart, count, options), options)
+    shift = _room(forks, bends, length)
     moved = shift > 0
     logger.info(
         "moved %d of %d forks by %.0f m on average", moved.sum(), len(moved), shift[moved].mean() if moved.any() else 0
@@ -208,15 +220,12 @@ def _branch_taken(forks: Forks, driven: Traversals, fork: NDArray[np.int64], end
 
 def _bends(apart: NDArray[np.float64], count: NDArray[np.int64], options: ForkOptions) -> NDArray[np.float64]:
     """Metres from each fork to where a level and a rise fit its distances best, ``(F,)``; 0 where nothing rises."""
-    at = (np.arange(apart.shape[1]) + 0.5) * _BIN
-    known = np.isfinite(apart) & (count >= max(options.min_traces, 1))
-    weight = np.where(known, np.minimum(count, _ENOUGH), 0).astype(np.float64)
-    value = np.where(known, apart, 0.0)
-    seen = np.where(known, at, 0.0).max(axis=1)
-    free = known.sum(axis=1) - 3.0  # level, rise and bend are fitted
+    at, weight, value = _weighted(apart, count, options)
+    seen = np.where(weight > 0, at, 0.0).max(axis=1)
+    free = (weight > 0).sum(axis=1) - 3.0  # level, rise and bend are fitted
     sums = weight.sum(axis=1), (weight * value).sum(axis=1), (weight * value**2).sum(axis=1)
     least, bend = np.full(len(apart), np.inf), np.zeros(len(apart))
-    for place in np.arange(_BIN, options.reach, _STEP):
+    for place in _places(options):
         rise = np.maximum(place - at, 0.0)
         r, rr, ry = weight @ rise, weight @ rise**2, (weight * value) @ rise
         spread = np.maximum(sums[0] * rr - r**2, 1e-9)
@@ -229,6 +238,55 @@ def _bends(apart: NDArray[np.float64], count: NDArray[np.int64], options: ForkOp
         least = np.where(better, error, least)
         bend = np.where(better, np.where(fits, place, 0.0), bend)
     return bend
+
+
+def _lane_ends(
+    apart: NDArray[np.float64], count: NDArray[np.int64], bend: NDArray[np.float64], options: ForkOptions
+) -> NDArray[np.float64]:
+    """Bends (m), ``(F,)``, and where two rises with a lane between them fit the distances much better, its end."""
+    bend = bend.copy()
+    some = np.flatnonzero(bend)
+    at, weight, value = _weighted(apart[some], count[some], options)
+    one_rise = np.min([_fit([np.maximum(place - at, 0.0)], weight, value)[1] for place in _places(options)], axis=0)
+    least, end = np.full(len(some), np.inf), np.zeros(len(some))
+    for start, length, change in product(_LANE_ENDS, _LANE_LENGTHS, _LANE_CHANGES):
+        if start + length > options.reach - 2.0 * _LEVEL:
+            continue
+        to_lane = np.clip((start + length + change - at) / change, 0.0, 1.0)
+        rises, error = _fit([to_lane, np.maximum(start - at, 0.0)][: 2 if start else 1], weight, value)
+        width = np.abs(rises[:, 0])
+        fits = (width > options.min_lane) & (width < options.max_lane) & (rises[:, 0] * rises[:, -1] >= 0.0)
+        better = fits & (error < least)
+        least, end = np.where(better, error, least), np.where(better, start, end)
+    changed = least < _LANE_GAIN * one_rise
+    bend[some[changed]] = end[changed]
+    return bend
+
+
+def _places(options: ForkOptions) -> NDArray[np.float64]:
+    """Bends that are tried, m from the fork."""
+    return np.arange(_BIN, options.reach, _STEP)
+
+
+def _weighted(
+    apart: NDArray[np.float64], count: NDArray[np.int64], options: ForkOptions
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Middles of the bins (m), ``(B,)``; weights and distances, ``(F, B)``, both 0 where too few traces are."""
+    known = np.isfinite(apart) & (count >= max(options.min_traces, 1))
+    weight = np.where(known, np.minimum(count, _ENOUGH), 0).astype(np.float64)
+    at = (np.arange(apart.shape[1], dtype=np.float64) + 0.5) * _BIN
+    return at, weight, np.where(known, apart, 0.0)
+
+
+def _fit(
+    terms: Sequence[NDArray[np.float64]], weight: NDArray[np.float64], value: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Fit a level and terms ``(B,)`` to each row of values: factors of the terms, ``(F, terms)``, squared errors."""
+    basis = np.vstack([np.ones(value.shape[1]), *terms])
+    normal = np.einsum("fb,ib,jb->fij", weight, basis, basis) + 1e-6 * np.eye(len(basis))
+    right = (weight * value) @ basis.T
+    factors = np.linalg.solve(normal, right[..., None])[..., 0]
+    return factors[:, 1:], np.maximum((weight * value**2).sum(axis=1) - (factors * right).sum(axis=1), 1e-9)
 
 
 def _room(forks: Forks, shift: NDArray[np.float64], length: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -53,6 +53,9 @@ class GapOptions:
     heading_length: float = 15.0  # m, over which the direction of a dead end is measured
     max_links: int = 2  # links at one node
     stem_turn: float = 20.0  # degrees, at both ends of a link between junctions that face each other; 0: no such links
+    max_jump: float = 100.0  # m, between edge ends that are joined because traces jump from one to the other; 0: none
+    min_jumps: int = 2  # traces that must
+    jump_turn: float = 60.0  # degrees, between road and link, at both of its ends
 
     def __post_init__(self) -> None:
         """Refuse negative numbers."""

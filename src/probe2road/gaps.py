@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from probe2road.clean import drop_edges, merge_degree_two_nodes
 from probe2road.errors import OptionError
+from probe2road.gap_jumps import jumped_gaps
 from probe2road.gap_links import (
     NO_NODE,
     DeadEnds,
@@ -36,7 +37,7 @@ from probe2road.roadgraph import RoadGraph, finish_edges
 from probe2road.splitting import split_edges
 from probe2road.undriven import traces_per_edge
 
-__all__ = ["GapOptions", "fill_gaps", "gap_weights", "prune_gaps"]
+__all__ = ["GapOptions", "fill_gaps", "fill_jumps", "gap_weights", "prune_gaps"]
 
 logger = logging.getLogger(__name__)
 
@@ -108,6 +109,40 @@ def fill_gaps(graph: RoadGraph, *, options: GapOptions | None = None) -> RoadGra
     stems = facing_stems(filled, options)
     logger.info("added %d gap edges between junctions", len(stems))
     return _with_edges(filled, *filled.nodes.index.to_numpy()[stems.T]) if len(stems) else filled
+
+
+def fill_jumps(graph: RoadGraph, steps: pd.DataFrame, *, options: GapOptions | None = None) -> RoadGraph:
+    """Add edges of origin ``gap`` where traces leave the graph and return to it.
+
+    The paper does not have this rule. Edge ends up to ``max_jump`` apart are joined if ``min_jumps`` traces or more
+    jump from one to the other, and if the turns at both ends are at most ``jump_turn``. A link may cross edges: so it
+    is where a road is lost between the others that it passes over.
+
+    Parameters
+    ----------
+    graph
+        Any road graph.
+    steps
+        Matched paths on it: `probe2road.mapmatch.Matches.steps`.
+    options
+        The defaults where it is None.
+
+    Returns
+    -------
+    RoadGraph
+        The same object where there is nothing to add. As with `fill_gaps`, links are proposals.
+
+    Examples
+    --------
+    >>> from probe2road.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(160, 0), (300, 0)]], crs="EPSG:32616")
+    >>> steps = pd.DataFrame({"trace_id": [1, 1, 2, 2], "edge": [0, 1, 0, 1], "forward": True})
+    >>> print(fill_jumps(graph, steps.assign(entered=False, left=False)).edges.geometry.iloc[2])
+    LINESTRING (100 0, 160 0)
+    """
+    pairs = jumped_gaps(graph, steps, options or GapOptions())
+    logger.info("added %d gap edges where traces jump", len(pairs))
+    return _with_edges(graph, *graph.nodes.index.to_numpy()[pairs.T]) if len(pairs) else graph
 
 
 def gap_weights(graph: RoadGraph, *, gap: float = 0.1) -> pd.Series:

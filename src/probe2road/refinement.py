@@ -17,14 +17,16 @@ from probe2road.errors import OptionError
 from probe2road.evidence import EvidenceOptions, add_evidence
 from probe2road.fleet import Fleet
 from probe2road.forks import ForkOptions, move_forks
-from probe2road.gaps import GapOptions, fill_gaps, gap_weights, prune_gaps
-from probe2road.mapmatch import MatchOptions, match
+from probe2road.gaps import GapOptions, fill_gaps, fill_jumps, gap_weights, prune_gaps
+from probe2road.mapmatch import Matches, MatchOptions, match
 from probe2road.passages import passing_positions
 from probe2road.roadgraph import RoadGraph
 from probe2road.undriven import RungOptions, drop_undriven
 from probe2road.workspace import Progress, Workspace, silent
 
 __all__ = ["RefineOptions", "refine_graph"]
+
+_SPLITS = 2  # how often junctions are split
 
 
 @dataclass(frozen=True)
@@ -106,30 +108,41 @@ def refine_graph(
     report = report or silent
     if graph.edges.empty:
         return graph
-    report("matching", 0, 4)
+    report("matching", 0, 6)
     filled = fill_gaps(graph, options=options.gaps)
-    matches = match(fleet, filled, options.matching, edge_weights=gap_weights(filled, gap=options.gap_weight))
+    matches = _matched(fleet, filled, options)
+    jumped = fill_jumps(filled, matches.steps, options=options.gaps)
+    if jumped is not filled:
+        filled, matches = jumped, _matched(fleet, jumped, options)
     graph = clean_graph(prune_gaps(filled, matches.steps, min_traces=options.min_traces), clean)
     work.write_graph("6-gaps-filled", graph)
 
-    report("matching", 1, 4)
+    # What is split and dropped the first time may have hidden further false junctions.
     matches = match(fleet, graph, options.matching)
-    positions = passing_positions(fleet, matches, graph)
-    graph = split_false_junctions(graph, matches.steps, positions=positions, options=options.junctions)
-
-    report("matching", 2, 4)
-    matches = match(fleet, graph, options.matching)
-    rungs = options.rungs if options.min_support else None
-    driven = drop_undriven(graph, matches.steps, min_traces=options.min_support or 0, rungs=rungs)
-    report("matching", 3, 4)
-    if driven is not graph:
-        graph = clean_graph(driven, clean)
-        matches = match(fleet, graph, options.matching)
+    for turn in range(_SPLITS):
+        report("matching", 1 + 2 * turn, 6)
+        positions = passing_positions(fleet, matches, graph)
+        split = split_false_junctions(graph, matches.steps, positions=positions, options=options.junctions)
+        if turn and (len(split.nodes), len(split.edges)) == (len(graph.nodes), len(graph.edges)):
+            break
+        graph, matches = split, match(fleet, split, options.matching)
+        report("matching", 2 + 2 * turn, 6)
+        rungs = options.rungs if options.min_support else None
+        driven = drop_undriven(graph, matches.steps, min_traces=options.min_support or 0, rungs=rungs)
+        if driven is not graph:
+            graph = clean_graph(driven, clean)
+            matches = match(fleet, graph, options.matching)
+    report("matching", 5, 6)
     moved = move_forks(graph, fleet, matches, options=options.forks)
     if moved is not graph:
         graph, matches = moved, match(fleet, moved, options.matching)
     graph = add_evidence(graph, fleet, matches, options=options.evidence)
     if options.move:
         graph = refine_centreline(graph, fleet, matches, options=options.centreline)
-    report("matching", 4, 4)
+    report("matching", 6, 6)
     return graph
+
+
+def _matched(fleet: Fleet, graph: RoadGraph, options: RefineOptions) -> Matches:
+    """Match to a graph with proposed links."""
+    return match(fleet, graph, options.matching, edge_weights=gap_weights(graph, gap=options.gap_weight))
