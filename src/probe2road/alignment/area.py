@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from probe2road.alignment.anchoring import anchored, middles
 from probe2road.alignment.floors import Floors, find_floors, floor_of
 from probe2road.alignment.graph import optimise
 from probe2road.alignment.heights import solve_heights
@@ -163,6 +164,11 @@ def _register(
     home = floor_of(floors, on.cell, height, options)
     if len(scene.seen.keyframe) == 0 or len(floors.cell) == 0:
         return pose, floors, height
+    if settled:
+        angle = spines.station[np.maximum(on.station, 0), 2]
+        pose = anchored(frames, pose, angle, home, options, held=scene.held)
+        on = project(spines, pose, options)
+        home = floor_of(floors, on.cell, height, options)
     points = _points_on_spines(scene, pose, spines)
     floor = floor_of(floors, points.cell, height[scene.seen.keyframe], options)
     found = floor >= 0
@@ -241,7 +247,7 @@ def _paths(
     if not blind.any():
         return _nothing()
     usable = floor >= 0
-    middle, drives = _middles(floor[usable], on.left[usable], scene.frames.drive[usable], len(floors.cell))
+    middle, drives = middles(floor[usable], on.left[usable], scene.frames.drive[usable], len(floors.cell))
     sigma = options.lane_sigma * scene.frames.inflation(options)
     off = on.left - np.where(usable, middle[floor], 0.0)
     k = np.flatnonzero(blind & (drives[floor] >= options.min_drives) & (np.abs(off) < _LANE_GATE * options.lane_sigma))
@@ -250,22 +256,6 @@ def _paths(
     normal = np.column_stack([-np.sin(angle), np.cos(angle), np.zeros(len(k))])
     information = normal[:, :, None] * normal[:, None, :] / sigma[k, None, None] ** 2 + np.diag([1e-6, 1e-6, 1e-4])
     return Condensed(k, floors.patch[floor], -normal * off[k, None], information)
-
-
-def _middles(
-    floor: NDArray[np.int64], left: NDArray[np.float64], drive: NDArray[np.int64], n: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Median offset of the paths on each floor (n,), and how many drives there are (n,)."""
-    order = np.lexsort((left, floor))
-    count = np.bincount(floor, minlength=n)
-    middle = np.zeros(n)
-    start = np.cumsum(count) - count
-    there = count > 0
-    ranked = left[order]
-    low, high = start[there] + (count[there] - 1) // 2, start[there] + count[there] // 2
-    middle[there] = (ranked[low] + ranked[high]) / 2.0
-    span = int(drive.max(initial=0)) + 1
-    return middle, np.bincount(np.unique(floor * span + drive) // span, minlength=n)
 
 
 def _patch_poses(spines: Spines, floors: Floors) -> NDArray[np.float64]:

@@ -1,0 +1,94 @@
+"""Anchoring: roads that all their drives were led away from are put back to where GNSS has them.
+
+Registration compares each drive with all others, so it finds a drive that lies a lane aside and not a road whose drives
+lie there together, as they may where another road joins: they agree, and none leaves alone. One drive says little about
+where the road is, its receiver is off by metres; the median of thirty is known to half a metre.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter, uniform_filter1d
+
+from probe2road.alignment.keyframes import Keyframes
+from probe2road.alignment.options import AlignOptions
+
+__all__ = ["anchored", "middles"]
+
+_DOUBT = 3.0  # standard errors of the middle of all recorded positions
+_LEAST = 1.5  # m; by less, about half a lane, a road may be off: drives share errors of GNSS
+_AROUND = 11  # keyframes of a chain over which moves are made alike
+
+
+def anchored(
+    frames: Keyframes,
+    pose: NDArray[np.float64],
+    angle: NDArray[np.float64],
+    home: NDArray[np.int64],
+    options: AlignOptions,
+    *,
+    held: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Move roads back that lie further from the middle of their recorded positions than GNSS can be off.
+
+    Parameters
+    ----------
+    frames
+        The keyframes as recorded.
+    pose
+        Where they are now: x, y (m), direction (radians), shape ``(k, 3)``.
+    angle
+        Direction of the road at each, radians, shape ``(k,)``.
+    home
+        Floor of each, -1 where it has none, shape ``(k,)``.
+    options
+        Of which ``min_drives`` is used.
+    held
+        Keyframes that stay, shape ``(k,)``.
+
+    Returns
+    -------
+    ndarray, shape (k, 3)
+        Poses; all on one floor have moved by about the same, to the side only.
+    """
+    cos, sin = np.cos(angle), np.sin(angle)
+    aside = cos * (frames.pose[:, 1] - pose[:, 1]) - sin * (frames.pose[:, 0] - pose[:, 0])
+    on = np.flatnonzero(home >= 0)
+    floor, n = home[on], int(home.max(initial=-1)) + 1
+    middle, drives = middles(floor, aside[on], frames.drive[on], n)
+    sigma = np.bincount(floor, frames.sigma[on], n) / np.maximum(np.bincount(floor, minlength=n), 1)
+    doubt = _DOUBT * sigma / np.sqrt(np.maximum(drives, 1))
+    led_away = (np.abs(middle) > np.maximum(doubt, _LEAST)) & (drives >= options.min_drives)
+    wanted = np.zeros(len(pose))
+    wanted[on] = np.where(led_away, middle, 0.0)[floor]
+    shift = np.where(held, 0.0, _smoothed(wanted, frames.starts))
+    return pose + np.column_stack([-sin * shift, cos * shift, np.zeros(len(pose))])
+
+
+def middles(
+    floor: NDArray[np.int64], left: NDArray[np.float64], drive: NDArray[np.int64], n: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Median offset of the paths on each floor (n,), and how many drives there are (n,)."""
+    order = np.lexsort((left, floor))
+    count = np.bincount(floor, minlength=n)
+    middle = np.zeros(n)
+    start = np.cumsum(count) - count
+    there = count > 0
+    ranked = left[order]
+    low, high = start[there] + (count[there] - 1) // 2, start[there] + count[there] // 2
+    middle[there] = (ranked[low] + ranked[high]) / 2.0
+    span = int(drive.max(initial=0)) + 1
+    return middle, np.bincount(np.unique(floor * span + drive) // span, minlength=n)
+
+
+def _smoothed(values: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Take the median, then the mean, of the values around each, chain by chain."""
+    smooth = values.copy()
+    for begin, end in pairwise(starts):
+        part = values[begin:end]
+        if part.any():
+            smooth[begin:end] = uniform_filter1d(median_filter(part, _AROUND, mode="nearest"), _AROUND, mode="nearest")
+    return smooth
