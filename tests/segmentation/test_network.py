@@ -173,3 +173,21 @@ def test_options_take_precedence_over_the_model(write_weights):
 def test_options_that_mean_nothing_are_refused(changes, message, fleet, write_weights):
     with pytest.raises(OptionError, match=message):
         network_segmenter(read_weights(write_weights()), fleet_grid(fleet), NetworkOptions(**changes))
+
+
+def test_a_network_that_is_asked_four_times_sees_no_direction():
+    grid = Grid(446000.0, 4636512.0, 1.0, 512, 512, CRS)
+    counts = np.random.default_rng(3).poisson(0.02, (1, 512, 512)).astype(np.uint32)
+    counts[0, 250:260, 40:] += 9
+    weights = read_weights(shipped_weights(points=False))
+    for turns, alike in ((1, False), (4, True)):
+        segmenter = network_segmenter(weights, grid, NetworkOptions(turns=turns, threads=1))
+        upright, turned = (segmenter.predict(np.rot90(counts, k, (1, 2)), grid) for k in (0, 1))
+        assert upright.max() > 0.5
+        assert np.allclose(np.rot90(upright), turned, atol=1e-4) == alike
+
+
+def test_more_than_four_right_angles_are_refused():
+    for turns in (0, 5):
+        with pytest.raises(OptionError, match=f"turns is {turns}"):
+            NetworkOptions(turns=turns)

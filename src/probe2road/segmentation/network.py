@@ -24,6 +24,7 @@ logger = logging.getLogger(__name__)
 
 _STEPS = np.float32(2**16)  # of the probability between 0 and 1: fewer digits, which compress
 _LARGEST_OVERLAP = 0.9
+_RIGHT_ANGLES = 4
 _NO_NETWORK = "use --segmenter density"
 
 
@@ -38,6 +39,7 @@ class NetworkOptions:
     overlap: float = 0.5  # of neighbouring tiles, as a part of their side
     threshold: float | None = None  # probability that continues a road; the model's own where None
     seed_threshold: float | None = None  # probability that starts one; the model's own where None
+    turns: int = 1  # right angles that every tile is turned by, up to 4; the mean of what the network says is taken
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing."""
@@ -47,6 +49,8 @@ class NetworkOptions:
         if not 0 <= self.overlap <= _LARGEST_OVERLAP:
             fix = f"use 0 to {_LARGEST_OVERLAP}, 0.5 for half a tile"
             raise OptionError(f"overlap is {self.overlap}", where=where, fix=fix)
+        if not 1 <= self.turns <= _RIGHT_ANGLES:
+            raise OptionError(f"turns is {self.turns}", where=where, fix=f"use 1 to {_RIGHT_ANGLES}")
         for name in ("threads", "tile"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -139,7 +143,8 @@ def network_segmenter(weights: Weights, grid: Grid, options: NetworkOptions | No
             raise InputError(what, where=weights.path, fix=f"give the channels {', '.join(CHANNELS)}")
         seen = np.zeros((1, len(channels), info.tile, info.tile), np.float32)  # at the far edges too
         seen[0, :, :rows, :cols] = network_input(counts[channels])
-        probability = run_network(network, seen)[0, :rows, :cols]
+        turned = (run_network(network, np.rot90(seen, k, (2, 3)))[0] for k in range(options.turns))
+        probability = sum(np.rot90(part, -k) for k, part in enumerate(turned))[:rows, :cols] / options.turns
         return np.asarray(np.round(probability * _STEPS) / _STEPS, np.float32)
 
     return Segmenter(
