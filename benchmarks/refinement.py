@@ -1,9 +1,10 @@
 """What each step of the refinement gives on the benchmark's test cities: the rows of the paper's Table V, and ours.
 
-Usage: python benchmarks/refinement.py FOLDER [NAMES...] [--segmenter network] [--pictures docs/img]
+Usage: python benchmarks/refinement.py FOLDER [NAMES...] [--segmenter network] [--work WORK] [--pictures docs/img]
 
-FOLDER holds the data sets that `probe2road benchmark prepare` made. Graphs are built from the aligned fleet data;
-scores are against the reference kept where at least four drives pass. Prints Markdown.
+FOLDER holds the data sets that `probe2road benchmark prepare` made. Graphs are built from the aligned fleet data, or
+are those that `probe2road benchmark run --poses modelled --work WORK` kept from before the refinement. Scores are
+against the reference kept where at least four drives pass. Prints Markdown.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from probe2road.evidence import add_evidence
 from probe2road.export import read_graph
 from probe2road.fleet import Fleet
 from probe2road.forks import move_forks
-from probe2road.gaps import fill_gaps, gap_weights, prune_gaps
+from probe2road.gaps import fill_gaps, fill_jumps, gap_weights, prune_gaps
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.mapmatch import match
 from probe2road.metrics import evaluate
@@ -52,6 +53,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", default=CITIES)
     parser.add_argument("--segmenter", default="density", choices=("density", "network"))
+    parser.add_argument("--work", type=Path, help="folder that benchmark run kept its work in")
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the densest interchanges")
     arguments = parser.parse_args()
     for name in arguments.names:
@@ -59,7 +61,7 @@ def main() -> None:
         fleet = read_fleet(folder / "aligned.parquet", folder / "aligned.points.parquet")
         reference = labelled_reference(read_graph(folder / "reference.gpkg"))
         print(f"\n## {name}\n\n| step | GEO F1/P/R | iTOPO F1/P/R | TOPO F1 | nodes | km | s |\n|{'---|' * 7}")
-        done = rows(fleet, arguments.segmenter)
+        done = rows(fleet, arguments.segmenter, kept(arguments.work, name, arguments.segmenter))
         for row in done:
             print(line(row, reference), flush=True)
         for number, place in enumerate(PLACES.get(name, ())) if arguments.pictures else ():
@@ -75,8 +77,14 @@ def around(place: tuple[float, float], fleet: Fleet) -> tuple[float, float, floa
     return x[0] - REACH, y[0] - REACH, x[0] + REACH, y[0] + REACH
 
 
-def rows(fleet: Fleet, segmenter: str) -> list[Row]:
-    """Refine step by step."""
+def kept(work: Path | None, name: str, segmenter: str) -> RoadGraph | None:
+    """Return the graph that a run of the benchmark had before the refinement."""
+    method = {"network": "probe2road", "density": "density"}[segmenter]
+    return read_graph(work / f"{name}-modelled" / method / "stages" / "5-cleaned.gpkg") if work else None
+
+
+def rows(fleet: Fleet, segmenter: str, built: RoadGraph | None) -> list[Row]:
+    """Refine step by step, what was built or what is built now."""
     done, started = [], time.perf_counter()
 
     def note(step: str, graph: RoadGraph) -> None:
@@ -84,12 +92,16 @@ def rows(fleet: Fleet, segmenter: str) -> list[Row]:
         done.append(Row(step, graph, time.perf_counter() - started))
         started = time.perf_counter()
 
-    built = build(fleet, BuildOptions(segmenter=segmenter, refine=False))
+    if built is None:
+        built = build(fleet, BuildOptions(segmenter=segmenter, refine=False))
     note("no post-processing", built)
     filled = fill_gaps(built)
     matches = match(fleet, filled, edge_weights=gap_weights(filled))
+    note("gap filling", clean_graph(prune_gaps(filled, matches.steps)))
+    filled = fill_jumps(filled, matches.steps)
+    matches = match(fleet, filled, edge_weights=gap_weights(filled))
     graph = clean_graph(prune_gaps(filled, matches.steps))
-    note("gap filling", graph)
+    note("and where traces jump", graph)
     matches = match(fleet, graph)
     for variant in ("literal", "guarded"):
         options = DisambiguateOptions(variant=variant)
@@ -102,6 +114,12 @@ def rows(fleet: Fleet, segmenter: str) -> list[Row]:
         graph = clean_graph(drop_undriven(graph, matches.steps, rungs=RungOptions()))
         matches = match(fleet, graph)
         note("undriven edges dropped", graph)
+    graph = split_false_junctions(graph, matches.steps, positions=passing_positions(fleet, matches, graph))
+    matches = match(fleet, graph)
+    if segmenter == "network":
+        graph = clean_graph(drop_undriven(graph, matches.steps, rungs=RungOptions()))
+        matches = match(fleet, graph)
+    note("split and dropped again", graph)
     graph = move_forks(graph, fleet, matches)
     note("forks moved", graph)
     if segmenter == "density":
