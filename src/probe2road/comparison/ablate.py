@@ -137,10 +137,12 @@ def _write_page(
     output: Path,
 ) -> None:
     """Write the page, and the cells behind it."""
-    first = cells[ablations[0].name][0]
+    first = ablations[0]
+    made = dict(zip((variant.label for variant in first.variants), cells[first.name], strict=True))
+    base = made.get(first.default, cells[first.name][0])
     head = (
         "# What matters: ablations beyond the paper\n\n"
-        f"Written by `probe2road benchmark ablate` from {first.area}, poses: {first.poses}. Each table changes one "
+        f"Written by `probe2road benchmark ablate` from {base.area}, poses: {base.poses}. Each table changes one "
         "thing of Probe2Road with GNSS and vision. Intervals, and the bars of the figures, hold 95 % of "
         f"{DRAWS} draws of tiles of 1 km by 1 km. A difference from the default is drawn from the same tiles for "
         "both, and is known better than either score.\n"
