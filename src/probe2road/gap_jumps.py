@@ -7,14 +7,12 @@ back at another, some metres ahead. Such a link may cross other roads, which is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from probe2road.gap_links import GapOptions, angle_between
+from probe2road.gap_links import GapOptions, angle_between, ends_of_lines
 from probe2road.roadgraph import RoadGraph
 
 __all__ = ["jumped_gaps"]
@@ -51,13 +49,14 @@ def jumped_gaps(graph: RoadGraph, steps: pd.DataFrame, options: GapOptions) -> N
     edge = graph.edges.index.get_indexer(steps["edge"])
     entered, left = (steps[name].to_numpy(bool) for name in ("entered", "left"))
     off = np.flatnonzero((trace[1:] == trace[:-1]) & ~left[:-1] & ~entered[1:])
-    away = _Ends.of(graph, edge[off], at_start=~forward[off], reach=options.heading_length)
-    back = _Ends.of(graph, edge[off + 1], at_start=forward[off + 1], reach=options.heading_length)
-    link = back.position - away.position
+    reach = options.heading_length
+    node, position, ahead = _ends(graph, edge[off], at_start=~forward[off], reach=reach)
+    other, there, back = _ends(graph, edge[off + 1], at_start=forward[off + 1], reach=reach)
+    link = there - position
     distance = np.hypot(*link.T)
-    turn = np.maximum(angle_between(away.ahead, link), angle_between(-back.ahead, link))
-    fits = (away.node != back.node) & (distance > 0) & (distance <= options.max_jump) & (turn <= options.jump_turn)
-    pairs = np.sort(np.stack([away.node, back.node], axis=1)[fits], axis=1)
+    turn = np.maximum(angle_between(ahead, link), angle_between(-back, link))
+    fits = (node != other) & (distance > 0) & (distance <= options.max_jump) & (turn <= options.jump_turn)
+    pairs = np.sort(np.stack([node, other], axis=1)[fits], axis=1)
     jumps = pd.DataFrame({"one": pairs[:, 0], "other": pairs[:, 1], "trace": trace[off[fits]]})
     traces = jumps.groupby(["one", "other"])["trace"].nunique()
     joined = np.sort(graph.nodes.index.get_indexer(graph.edges[["u", "v"]].to_numpy().ravel()).reshape(-1, 2), axis=1)
@@ -65,23 +64,10 @@ def jumped_gaps(graph: RoadGraph, steps: pd.DataFrame, options: GapOptions) -> N
     return np.array(found.to_list(), np.int64).reshape(-1, 2)
 
 
-@dataclass(frozen=True)
-class _Ends:
-    """n ends of edges."""
-
-    node: NDArray[np.int64]  # (n,) row
-    position: NDArray[np.float64]  # (n, 2) m
-    ahead: NDArray[np.float64]  # (n, 2) m, out of the road
-
-    @classmethod
-    def of(cls, graph: RoadGraph, edge: NDArray[np.int64], *, at_start: NDArray[np.bool_], reach: float) -> _Ends:
-        """Look up ends by rows of edges, and their directions over a length."""
-        node = np.where(at_start, *(graph.edges[end].to_numpy()[edge] for end in ("u", "v")))
-        lines = shapely.force_2d(graph.edges.geometry.to_numpy()[edge])
-        length = shapely.length(lines)
-        tip = np.where(at_start, 0.0, length)
-        inner = np.where(at_start, np.minimum(reach, length), np.maximum(length - reach, 0.0))
-        position, inside = (
-            shapely.get_coordinates(shapely.line_interpolate_point(lines, along)) for along in (tip, inner)
-        )
-        return cls(graph.nodes.index.get_indexer(node).astype(np.int64), position, position - inside)
+def _ends(
+    graph: RoadGraph, edge: NDArray[np.int64], *, at_start: NDArray[np.bool_], reach: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Look up ends by rows of edges: rows of their nodes ``(n,)``, positions and directions (m) ``(n, 2)``."""
+    node = np.where(at_start, *(graph.edges[end].to_numpy()[edge] for end in ("u", "v")))
+    lines = shapely.force_2d(graph.edges.geometry.to_numpy()[edge])
+    return graph.nodes.index.get_indexer(node).astype(np.int64), *ends_of_lines(lines, at_start, reach)

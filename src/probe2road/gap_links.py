@@ -27,6 +27,7 @@ __all__ = [
     "angle_between",
     "crosses",
     "dead_ends",
+    "ends_of_lines",
     "straight_on",
     "to_dead_ends",
     "to_edges_beside",
@@ -94,6 +95,32 @@ class Links:
         return Links(*(getattr(self, field.name)[kept] for field in fields(self)))
 
 
+def ends_of_lines(
+    lines: NDArray[np.object_], at_start: NDArray[np.bool_], reach: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return one end of each line and the vector that leads there from within, over a length or all of it.
+
+    Parameters
+    ----------
+    lines
+        In plan, shape ``(n,)``.
+    at_start
+        Which end, shape ``(n,)``.
+    reach
+        The length, m.
+
+    Returns
+    -------
+    position, ahead
+        Metres, shape ``(n, 2)`` each; a vector is zero where its line comes back to its end.
+    """
+    length = shapely.length(lines)
+    tip = np.where(at_start, 0.0, length)
+    inner = np.where(at_start, np.minimum(reach, length), np.maximum(length - reach, 0.0))
+    position, inside = (shapely.get_coordinates(shapely.line_interpolate_point(lines, along)) for along in (tip, inner))
+    return position, position - inside
+
+
 def dead_ends(graph: RoadGraph, lines: NDArray[np.object_], reach: float) -> DeadEnds:
     """Collect the ends of edges at nodes of degree 1."""
     row = pd.Series(np.arange(len(graph.nodes)), index=graph.nodes.index)
@@ -101,10 +128,7 @@ def dead_ends(graph: RoadGraph, lines: NDArray[np.object_], reach: float) -> Dea
     degree = np.bincount(node.ravel(), minlength=len(graph.nodes))
     side, edge = np.nonzero(degree[node] == 1)
     at_start = side == 0
-    length = shapely.length(lines[edge])
-    position = shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], np.where(at_start, 0.0, length)))
-    inner = np.where(at_start, np.minimum(reach, length), np.maximum(length - reach, 0.0))
-    ahead = position - shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], inner))
+    position, ahead = ends_of_lines(lines[edge], at_start, reach)
     # An edge that curls back onto its end within the reach has no direction; it is left out.
     norm = np.hypot(*ahead.T)
     kept = norm > 0

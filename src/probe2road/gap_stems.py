@@ -18,7 +18,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from probe2road.gap_links import GapOptions, angle_between
+from probe2road.gap_links import GapOptions, angle_between, ends_of_lines
 from probe2road.roadgraph import RoadGraph
 
 __all__ = ["facing_stems"]
@@ -82,12 +82,8 @@ def _stems(
     lines = shapely.force_2d(graph.edges.geometry.to_numpy())
     row = pd.Series(np.arange(len(graph.nodes)), index=graph.nodes.index)
     node = np.concatenate([row[graph.edges[end]].to_numpy() for end in ("u", "v")])
-    length = np.tile(shapely.length(lines), 2)
     at_start = np.arange(len(node)) < len(lines)
-    both = np.concatenate([lines, lines])
-    position = shapely.get_coordinates(shapely.line_interpolate_point(both, np.where(at_start, 0.0, length)))
-    inner = np.where(at_start, np.minimum(reach, length), np.maximum(length - reach, 0.0))
-    ahead = position - shapely.get_coordinates(shapely.line_interpolate_point(both, inner))
+    position, ahead = ends_of_lines(np.concatenate([lines, lines]), at_start, reach)
     ends = pd.DataFrame({"node": node, "end": np.arange(len(node))})
     met = ends.merge(ends, on="node", suffixes=("", "_other"))
     met = met[met["end"] != met["end_other"]]
