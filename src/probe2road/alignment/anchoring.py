@@ -11,10 +11,11 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 
 from probe2road.alignment.keyframes import Keyframes
 from probe2road.alignment.options import AlignOptions
+from probe2road.alignment.profiles import Places
 
 __all__ = ["anchored", "middles"]
 
@@ -28,6 +29,7 @@ def anchored(
     pose: NDArray[np.float64],
     angle: NDArray[np.float64],
     home: NDArray[np.int64],
+    places: Places,
     options: AlignOptions,
     *,
     held: NDArray[np.bool_],
@@ -44,10 +46,12 @@ def anchored(
         Direction of the road at each, radians, shape ``(k,)``.
     home
         Floor of each, -1 where it has none, shape ``(k,)``.
+    places
+        Neighbours of each floor along the road.
     options
         Of which ``min_drives`` is used.
     held
-        Keyframes that stay, shape ``(k,)``.
+        Keyframes that stay, shape ``(k,)``; so do roads that one of them is on.
 
     Returns
     -------
@@ -57,14 +61,16 @@ def anchored(
     cos, sin = np.cos(angle), np.sin(angle)
     aside = cos * (frames.pose[:, 1] - pose[:, 1]) - sin * (frames.pose[:, 0] - pose[:, 0])
     on = np.flatnonzero(home >= 0)
-    floor, n = home[on], int(home.max(initial=-1)) + 1
+    floor, n = home[on], len(places.before)
     middle, drives = middles(floor, aside[on], frames.drive[on], n)
     sigma = np.bincount(floor, frames.sigma[on], n) / np.maximum(np.bincount(floor, minlength=n), 1)
     doubt = _DOUBT * sigma / np.sqrt(np.maximum(drives, 1))
     led_away = (np.abs(middle) > np.maximum(doubt, _LEAST)) & (drives >= options.min_drives)
-    wanted = np.zeros(len(pose))
+    wanted, beside_held = np.zeros(len(pose)), np.zeros(len(pose), bool)
     wanted[on] = np.where(led_away, middle, 0.0)[floor]
-    shift = np.where(held, 0.0, _smoothed(wanted, frames.starts))
+    has_held = np.append(np.bincount(floor, held[on], n) > 0, False)  # the last one is no floor
+    beside_held[on] = (has_held[:-1] | has_held[places.before] | has_held[places.after])[floor]
+    shift = np.where(held, 0.0, _smoothed(wanted, beside_held, frames.starts))
     return pose + np.column_stack([-sin * shift, cos * shift, np.zeros(len(pose))])
 
 
@@ -84,11 +90,13 @@ def middles(
     return middle, np.bincount(np.unique(floor * span + drive) // span, minlength=n)
 
 
-def _smoothed(values: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Take the median, then the mean, of the values around each, chain by chain."""
+def _smoothed(values: NDArray[np.float64], fixed: NDArray[np.bool_], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Take the median, then the mean, of the values around each, chain by chain; 0 around what is fixed."""
     smooth = values.copy()
     for begin, end in pairwise(starts):
         part = values[begin:end]
         if part.any():
-            smooth[begin:end] = uniform_filter1d(median_filter(part, _AROUND, mode="nearest"), _AROUND, mode="nearest")
+            free = ~maximum_filter1d(fixed[begin:end], _AROUND, mode="nearest")
+            middle = median_filter(part, _AROUND, mode="nearest") * free
+            smooth[begin:end] = uniform_filter1d(middle, _AROUND, mode="nearest") * free
     return smooth

@@ -166,7 +166,7 @@ def _register(
         return pose, floors, height
     if settled:
         angle = spines.station[np.maximum(on.station, 0), 2]
-        pose = anchored(frames, pose, angle, home, options, held=scene.held)
+        pose = anchored(frames, pose, angle, home, floors.places, options, held=scene.held)
         on = project(spines, pose, options)
         home = floor_of(floors, on.cell, height, options)
     points = _points_on_spines(scene, pose, spines)
