@@ -224,7 +224,7 @@ class TestArtefacts:
     def test_traces_that_coincide_prove_a_real_road(self) -> None:
         assert len(split_false_junctions(FLAT, self.crossing, positions=apart(self.crossing, 2.0)).edges) == 5
 
-    @pytest.mark.parametrize(("height", "edges"), [(6.0, 2), (3.0, 5)])
+    @pytest.mark.parametrize(("height", "edges"), [(8.0, 2), (6.0, 5), (3.0, 5)])  # four traces each
     def test_traces_that_coincide_in_plan_part_by_height(self, height: float, edges: int) -> None:
         positions = apart(self.crossing, 1.0)
         upper = positions["trace_id"].map(self.crossing.groupby("trace_id")["edge"].first()) == 1

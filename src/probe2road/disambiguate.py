@@ -32,6 +32,8 @@ logger = logging.getLogger(__name__)
 
 VARIANTS = ("guarded", "literal")
 
+_SURE = 1.5  # times the usual confidence, where height alone tells an artefact from a real road
+
 
 @dataclass(frozen=True)
 class DisambiguateOptions:
@@ -188,7 +190,9 @@ def _artefacts(
         z=double.xyz[over, 2], row=double.junction[over] - len(graph.nodes), group=came
     )
     of_group = table[came == went].groupby(["row", "group"])
-    middle = of_group.median().assign(error=spread / np.sqrt(of_group["z"].count()))
+    traces = of_group["z"].count()
+    # One trace may be metres off, all along.
+    middle = of_group.median().assign(error=(spread / np.sqrt(traces)).where(traces > 1, np.inf))
     found = [row for row, groups in middle.groupby(level="row") if _are_apart(groups, options)]
     u, v = graph.edges[["u", "v"]].to_numpy().T
     length = graph.edges["length"].to_numpy()
@@ -212,7 +216,7 @@ def _are_apart(groups: pd.DataFrame, options: DisambiguateOptions) -> bool:
     places, z, error = groups.iloc[:, :4].to_numpy(), groups["z"].to_numpy(), groups["error"].to_numpy()
     away = (places[one] - places[other]).reshape(-1, 2, 2)
     beside = (np.hypot(away[..., 0], away[..., 1]) >= options.min_apart).all(axis=1)
-    least = np.maximum(options.min_height, options.confidence * np.hypot(error[one], error[other]))
+    least = np.maximum(options.min_height, _SURE * options.confidence * np.hypot(error[one], error[other]))
     above = np.abs(z[one] - z[other]) >= least
     return len(one) > 0 and bool((beside | above).all())
 
