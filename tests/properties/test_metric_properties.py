@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 import shapely.affinity
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from probe2road.metrics import GeoOptions, evaluate, geo, itopo, junctions, lateral
@@ -38,6 +38,7 @@ def graph(lines: list[Any]) -> RoadGraph:
 
 @settings(max_examples=15, deadline=None)
 @given(street_lines())
+@example([[(0.0, 0.0), (0.0, 20.0), (0.0, 40.0)], [(0.0, 0.0), (0.0, 40.0), (0.0, 80.0)]])  # one upon the other
 def test_a_graph_against_itself_scores_one(lines: list[Any]) -> None:
     table = evaluate(graph(lines), graph(lines), metrics=CHEAP)
     assert table["f1"].to_numpy() == pytest.approx(1.0)

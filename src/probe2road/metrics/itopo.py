@@ -183,6 +183,11 @@ def project_nodes(
     points = shapely.points(network.node_xy[nodes])
     row, candidate = shapely.STRtree(other.lines).query(points, predicate="dwithin", distance=options.radius + EPSILON)
     along = shapely.line_locate_point(other.lines[candidate], points[row])
+    # A line that comes back to its own end is found where it passes there first; the end is meant.
+    last = shapely.distance(shapely.get_point(other.lines[candidate], -1), points[row])
+    along = np.where(
+        last <= shapely.distance(other.lines[candidate], points[row]) + EPSILON, other.length[candidate], along
+    )
     xy, direction = locate(other, candidate, along)
     gap = np.hypot(*(xy - network.node_xy[nodes[row]]).T)
     closest = np.full(len(nodes), np.inf)
