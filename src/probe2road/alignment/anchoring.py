@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 
-from probe2road.alignment.keyframes import Keyframes
+from probe2road.alignment.floors import middles
+from probe2road.alignment.keyframes import Keyframes, moved_aside, recorded_aside
 from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.profiles import Places
 
-__all__ = ["anchored", "middles"]
+__all__ = ["anchored"]
 
 _DOUBT = 3.0  # standard errors of the middle of all recorded positions
 _LEAST = 1.5  # m; by less, about half a lane, a road may be off: drives share errors of GNSS
@@ -58,11 +59,9 @@ def anchored(
     ndarray, shape (k, 3)
         Poses; all on one floor have moved by about the same, to the side only.
     """
-    cos, sin = np.cos(angle), np.sin(angle)
-    aside = cos * (frames.pose[:, 1] - pose[:, 1]) - sin * (frames.pose[:, 0] - pose[:, 0])
     on = np.flatnonzero(home >= 0)
     floor, n = home[on], len(places.before)
-    middle, drives = middles(floor, aside[on], frames.drive[on], n)
+    middle, drives = middles(floor, recorded_aside(frames, pose, angle)[on], frames.drive[on], n)
     sigma = np.bincount(floor, frames.sigma[on], n) / np.maximum(np.bincount(floor, minlength=n), 1)
     doubt = _DOUBT * sigma / np.sqrt(np.maximum(drives, 1))
     led_away = (np.abs(middle) > np.maximum(doubt, _LEAST)) & (drives >= options.min_drives)
@@ -71,23 +70,7 @@ def anchored(
     has_held = np.append(np.bincount(floor, held[on], n) > 0, False)  # the last one is no floor
     beside_held[on] = (has_held[:-1] | has_held[places.before] | has_held[places.after])[floor]
     shift = np.where(held, 0.0, _smoothed(wanted, beside_held, frames.starts))
-    return pose + np.column_stack([-sin * shift, cos * shift, np.zeros(len(pose))])
-
-
-def middles(
-    floor: NDArray[np.int64], left: NDArray[np.float64], drive: NDArray[np.int64], n: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Median offset of the paths on each floor (n,), and how many drives there are (n,)."""
-    order = np.lexsort((left, floor))
-    count = np.bincount(floor, minlength=n)
-    middle = np.zeros(n)
-    start = np.cumsum(count) - count
-    there = count > 0
-    ranked = left[order]
-    low, high = start[there] + (count[there] - 1) // 2, start[there] + count[there] // 2
-    middle[there] = (ranked[low] + ranked[high]) / 2.0
-    span = int(drive.max(initial=0)) + 1
-    return middle, np.bincount(np.unique(floor * span + drive) // span, minlength=n)
+    return moved_aside(pose, angle, shift)
 
 
 def _smoothed(values: NDArray[np.float64], fixed: NDArray[np.bool_], starts: NDArray[np.int64]) -> NDArray[np.float64]:

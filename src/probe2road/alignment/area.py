@@ -11,12 +11,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from probe2road.alignment.anchoring import anchored, middles
-from probe2road.alignment.floors import Floors, find_floors, floor_of
+from probe2road.alignment.anchoring import anchored
+from probe2road.alignment.floors import Floors, find_floors, floor_of, middles
 from probe2road.alignment.graph import optimise
 from probe2road.alignment.heights import solve_heights
 from probe2road.alignment.hypotheses import Track
-from probe2road.alignment.keyframes import Keyframes, Sightings, keyframes, sightings, wrapped
+from probe2road.alignment.keyframes import (
+    Keyframes,
+    Sightings,
+    keyframes,
+    moved_aside,
+    recorded_aside,
+    sightings,
+    wrapped,
+)
 from probe2road.alignment.lines import Condensed, Matches, condense, match_lines
 from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.profiles import ShiftSearch
@@ -174,7 +182,7 @@ def _register(
     found = floor >= 0
     seen = Evidence(scene.seen.keyframe[found], floor[found], points.left[found], scene.seen.kind[found])
     angle = spines.station[np.maximum(on.station, 0), 2]
-    recorded = np.cos(angle) * (frames.pose[:, 1] - pose[:, 1]) - np.sin(angle) * (frames.pose[:, 0] - pose[:, 0])
+    recorded = recorded_aside(frames, pose, angle)
     track = Track(
         home, on.left, recorded, np.maximum(frames.motion_sigma[:, 1], _LEAST_MOVE),
         np.sqrt(2.0) * frames.sigma * frames.inflation(options),
@@ -183,10 +191,7 @@ def _register(
         options.search, _SEARCH_BIN, options.search + 20.0, _SEARCH_KERNEL, _SEARCH_DOUBT, _SEARCH_TEMPER
     )
     shift = register(seen, floors.places, scene.chains, track, search, settled=settled)
-    moved = pose.copy()
-    moved[:, 0] -= np.where(home >= 0, shift * np.sin(angle), 0.0)
-    moved[:, 1] += np.where(home >= 0, shift * np.cos(angle), 0.0)
-    return moved, floors, height
+    return moved_aside(pose, angle, np.where(home >= 0, shift, 0.0)), floors, height
 
 
 def _round(

@@ -18,7 +18,7 @@ from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.profiles import Places
 from probe2road.alignment.spines import OnSpines, Spines
 
-__all__ = ["Floors", "find_floors", "floor_of"]
+__all__ = ["Floors", "find_floors", "floor_of", "middles"]
 
 _LOOK_AHEAD = 4  # cells ahead of a keyframe in which it sees things, and one behind
 _FAR = 10_000.0  # m, more than any height
@@ -102,3 +102,19 @@ def floor_of(
     alone = np.bincount(floors.cell, minlength=int(cell.max(initial=0)) + 1)[np.maximum(cell, 0)] == 1
     near = np.abs(floors.height[nearest] - np.nan_to_num(height)) <= 2.0 * options.altitude_gate
     return np.where((cell >= 0) & fits & np.where(unknown, alone, near), nearest, -1)
+
+
+def middles(
+    floor: NDArray[np.int64], left: NDArray[np.float64], drive: NDArray[np.int64], n: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the median offset of the paths on each of n floors, and how many drives there are, shape ``(n,)`` each."""
+    order = np.lexsort((left, floor))
+    count = np.bincount(floor, minlength=n)
+    middle = np.zeros(n)
+    start = np.cumsum(count) - count
+    there = count > 0
+    ranked = left[order]
+    low, high = start[there] + (count[there] - 1) // 2, start[there] + count[there] // 2
+    middle[there] = (ranked[low] + ranked[high]) / 2.0
+    span = int(drive.max(initial=0)) + 1
+    return middle, np.bincount(np.unique(floor * span + drive) // span, minlength=n)

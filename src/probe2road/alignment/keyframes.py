@@ -20,7 +20,16 @@ from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.screening import rows_of_points
 from probe2road.fleet import POINT_KINDS, Fleet, trace_breaks
 
-__all__ = ["Keyframes", "Sightings", "fixes_course", "keyframes", "sightings", "wrapped"]
+__all__ = [
+    "Keyframes",
+    "Sightings",
+    "fixes_course",
+    "keyframes",
+    "moved_aside",
+    "recorded_aside",
+    "sightings",
+    "wrapped",
+]
 
 _COURSE_STEP = 2.0  # m; shorter steps leave the course as it was
 _UNKNOWN_SHARE = 0.02  # of the distance, 1 sigma of the motion, where dead reckoning cannot check it
@@ -80,6 +89,19 @@ class Sightings:
 def wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Bring angles into -pi to pi."""
     return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi, np.float64)
+
+
+def recorded_aside(frames: Keyframes, pose: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far to the left of its pose each keyframe was recorded, m, for directions of roads (radians)."""
+    east, north = (frames.pose[:, :2] - pose[:, :2]).T
+    return np.asarray(np.cos(angle) * north - np.sin(angle) * east)
+
+
+def moved_aside(
+    pose: NDArray[np.float64], angle: NDArray[np.float64], shift: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Move poses to the left (m) of the directions of their roads (radians)."""
+    return pose + np.column_stack([-shift * np.sin(angle), shift * np.cos(angle), np.zeros(len(pose))])
 
 
 def keyframes(fleet: Fleet, options: AlignOptions) -> Keyframes:
