@@ -14,6 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.alignment.options import AlignOptions
+from probe2road.alignment.reckoning import steadying
 from probe2road.alignment.report import AlignmentReport, make_report
 from probe2road.alignment.screening import screen_drives
 from probe2road.alignment.tiling import align_tiles, find_tiles, moved_fleet
@@ -157,12 +158,14 @@ def _align(
     usable = reasons == ""
     owner = np.repeat(np.arange(fleet.n_traces), np.diff(fleet.starts))
     touched = (usable & ~held)[owner]
+    steady = np.where(touched[:, None], steadying(fleet), 0.0)
+    fleet = moved_fleet(fleet, np.column_stack([steady, np.zeros_like(steady)]))
     tiles = find_tiles(fleet, options, touched=touched if held.any() else None)
     kept = open_workspace(folder, fleet, _Run(options, int(held.sum())))
     moves = align_tiles(fleet, usable, tiles, options, held=held, workspace=kept, workers=workers, progress=progress)
     report = make_report(fleet, reasons, held, moves)
     # Held drives do not move, not even by what rounding leaves.
-    shift = np.where((usable & ~held)[owner, None], moves.shift, 0.0)
+    shift = np.where(touched[:, None], moves.shift, 0.0)
     result = moved_fleet(fleet, shift)
     if not options.keep_rejected:
         result = _without(result, report.drives.loc[~usable, "trace_id"])

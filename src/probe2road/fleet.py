@@ -23,7 +23,15 @@ from probe2road.fleet_tables import (
     sort_fixes,
 )
 
-__all__ = ["POINT_KINDS", "Fleet", "TraceGaps", "fleet_from_checked", "fleet_from_tables", "trace_breaks"]
+__all__ = [
+    "POINT_KINDS",
+    "Fleet",
+    "TraceGaps",
+    "fix_intervals",
+    "fleet_from_checked",
+    "fleet_from_tables",
+    "trace_breaks",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -140,7 +148,7 @@ def trace_breaks(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool
     starts = fleet.starts
     breaks[starts[:-1]] = True
     step = np.hypot(*(np.diff(fleet.traces[axis].to_numpy(), prepend=np.nan) for axis in "xy"))
-    interval = _intervals(fleet.traces["t"])
+    interval = fix_intervals(fleet.traces["t"])
     within = ~breaks
     owner = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     # Only traces with a fix beyond a fixed limit need their medians: few, where the data is dense.
@@ -283,8 +291,8 @@ def _projected(table: pd.DataFrame, source: CRS, target: CRS) -> pd.DataFrame:
     return table.assign(x=x, y=y)
 
 
-def _intervals(times: pd.Series) -> NDArray[np.float64]:
-    """Seconds since the fix before, NaN where there is none or no clock."""
+def fix_intervals(times: pd.Series) -> NDArray[np.float64]:
+    """Seconds since the row before, also across traces; NaN where there is none or no clock."""
     time = times.to_numpy(dtype="datetime64[ns]")
     seconds = np.diff(time, prepend=np.datetime64("NaT", "ns")) / np.timedelta64(1, "s")
     return np.asarray(seconds, np.float64)

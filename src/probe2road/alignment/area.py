@@ -23,11 +23,11 @@ from probe2road.alignment.keyframes import (
     moved_aside,
     recorded_aside,
     sightings,
-    wrapped,
 )
 from probe2road.alignment.lines import Condensed, Matches, condense, match_lines
 from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.profiles import ShiftSearch
+from probe2road.alignment.reckoning import wrapped
 from probe2road.alignment.registration import Chains, Evidence, register
 from probe2road.alignment.routes import route_heights
 from probe2road.alignment.spines import CELL, OnSpines, Spines, find_spines, project

@@ -17,24 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe2road.alignment.options import AlignOptions
+from probe2road.alignment.reckoning import fixes_course, reckoned_steps, wrapped
 from probe2road.alignment.screening import rows_of_points
-from probe2road.fleet import POINT_KINDS, Fleet, trace_breaks
+from probe2road.fleet import POINT_KINDS, Fleet, fix_intervals, trace_breaks
 
 __all__ = [
     "Keyframes",
     "Sightings",
-    "fixes_course",
     "keyframes",
     "moved_aside",
     "recorded_aside",
     "sightings",
-    "wrapped",
 ]
 
-_COURSE_STEP = 2.0  # m; shorter steps leave the course as it was
 _UNKNOWN_SHARE = 0.02  # of the distance, 1 sigma of the motion, where dead reckoning cannot check it
 _TURN_SHARE = 0.15  # of distance times turn (radians), 1 sigma: what lies between sparse fixes on a bend is not known
 _FIRST_SIGMA = 0.02  # m, of the motion, however short
+_UNSEEN = 0.3  # m/s2, 1 sigma, of the acceleration that neither of two fixes shows, for dead reckoning between them
 
 
 @dataclass(frozen=True)
@@ -86,11 +85,6 @@ class Sightings:
     kind: NDArray[np.int8]  # (p,) index into POINT_KINDS
 
 
-def wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bring angles into -pi to pi."""
-    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi, np.float64)
-
-
 def recorded_aside(frames: Keyframes, pose: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how far to the left of its pose each keyframe was recorded, m, for directions of roads (radians)."""
     east, north = (frames.pose[:, :2] - pose[:, :2]).T
@@ -131,19 +125,20 @@ def keyframes(fleet: Fleet, options: AlignOptions) -> Keyframes:
     xy = traces[["x", "y"]].to_numpy(np.float64)
     breaks = trace_breaks(fleet)
     theta = fixes_course(fleet, breaks)
-    reckoned = _dead_reckoning(fleet, theta, breaks)
+    reckoned = reckoned_steps(fleet, theta, breaks)
     step = np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)
     known = np.isfinite(reckoned).all(axis=1)
     # While a vehicle stands its position wanders; its wheels do not turn.
     step = np.where(known, np.minimum(step, np.hypot(*np.nan_to_num(reckoned).T) + 0.1 * step), step)
     step[breaks] = 0.0
+    unseen = np.where(known, _UNSEEN / 2.0 * fix_intervals(traces["t"]) ** 2, 0.0)
     distance = np.cumsum(step)
 
     chain = np.cumsum(breaks) - 1
     chosen = _chosen(distance, chain, options.keyframe_spacing)
     row = np.flatnonzero(chosen)
     pose = np.column_stack([xy[row], theta[row]])
-    motion, sigma = _motions(pose, distance[row], reckoned, row, chain[row], options)
+    motion, sigma = _motions(pose, distance[row], reckoned, unseen, row, chain[row], options)
     accuracy = traces["accuracy"].to_numpy(np.float64) if "accuracy" in traces else np.full(len(traces), np.nan)
     drive = np.repeat(np.arange(fleet.n_traces), np.diff(starts))
     return Keyframes(
@@ -171,44 +166,6 @@ def sightings(fleet: Fleet, frames: Keyframes) -> Sightings:
     return Sightings(frame, body, kind)
 
 
-def fixes_course(fleet: Fleet, breaks: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Direction of travel at every fix: the recorded heading, or where there is none, that of the positions.
-
-    Parameters
-    ----------
-    fleet
-        The fleet.
-    breaks
-        Fixes that no motion leads to, shape ``(n,)``.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Radians counter-clockwise from east. A standing vehicle keeps its direction.
-    """
-    traces = fleet.traces
-    xy = traces[["x", "y"]].to_numpy(np.float64)
-    n = len(xy)
-    before = np.maximum(np.arange(n) - 1, 0)
-    after = np.minimum(np.arange(n) + 1, n - 1)
-    before[breaks] = np.flatnonzero(breaks)
-    ends = np.append(breaks[1:], True)
-    after[ends] = np.flatnonzero(ends)
-    leg = xy[after] - xy[before]
-    course = np.arctan2(leg[:, 1], leg[:, 0])
-    moving = np.hypot(*leg.T) >= _COURSE_STEP
-    chain = np.cumsum(breaks) - 1
-    # The last moving fix before, or else the first behind, within the chain.
-    last = np.maximum.accumulate(np.where(moving, np.arange(n), -1))
-    following = np.minimum.accumulate(np.where(moving, np.arange(n), n - 1)[::-1])[::-1]
-    source = np.where((last >= 0) & (chain[last] == chain), last, following)
-    course = course[np.where(chain[source] == chain, source, np.arange(n))]
-    if "heading" not in traces:
-        return course
-    heading = np.pi / 2.0 - np.radians(traces["heading"].to_numpy(np.float64))
-    return wrapped(np.where(np.isfinite(heading), heading, course))
-
-
 def _chosen(distance: NDArray[np.float64], chain: NDArray[np.int64], spacing: float) -> NDArray[np.bool_]:
     """Choose the first and last fix of each chain, and the first in each stretch of the spacing."""
     first = np.flatnonzero(np.diff(chain, prepend=-1))
@@ -219,26 +176,11 @@ def _chosen(distance: NDArray[np.float64], chain: NDArray[np.int64], spacing: fl
     return chosen
 
 
-def _dead_reckoning(fleet: Fleet, theta: NDArray[np.float64], breaks: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Motion (n, 2) from the fix before, m east and north, by heading and speed; NaN where they are not known."""
-    traces = fleet.traces
-    motion = np.full((len(traces), 2), np.nan)
-    if "speed" not in traces or "heading" not in traces:
-        return motion
-    speed = traces["speed"].to_numpy(np.float64)
-    interval = np.diff(traces["t"].to_numpy("datetime64[ns]"), prepend=np.datetime64("NaT", "ns"))
-    seconds = interval / np.timedelta64(1, "s")
-    length = (speed + np.roll(speed, 1)) / 2.0 * seconds
-    middle = theta - wrapped(theta - np.roll(theta, 1)) / 2.0
-    motion[:, 0], motion[:, 1] = length * np.cos(middle), length * np.sin(middle)
-    motion[breaks] = np.nan
-    return motion
-
-
 def _motions(
     pose: NDArray[np.float64],
     distance: NDArray[np.float64],
     reckoned: NDArray[np.float64],
+    unseen: NDArray[np.float64],
     row: NDArray[np.int64],
     chain: NDArray[np.int64],
     options: AlignOptions,
@@ -260,7 +202,9 @@ def _motions(
     length = np.abs(distance - distance[before])
     share = np.where(has_both, options.odometry_share, _UNKNOWN_SHARE) + _TURN_SHARE * np.abs(turn) * (length > 50.0)
     apart = np.abs(both[0] - both[1]) / 2.0
-    sigma = np.hypot((_FIRST_SIGMA + share * length)[:, None], apart)
+    doubt = np.concatenate([[0.0], np.cumsum(unseen**2)])
+    between = np.where(has_both, doubt[row + 1] - doubt[row[before] + 1], 0.0)
+    sigma = np.sqrt((_FIRST_SIGMA + share * length)[:, None] ** 2 + apart**2 + between[:, None])
     turn_sigma = np.radians(options.odometry_heading) * np.sqrt(1.0 + length / 100.0) + np.where(has_both, 0.0, 0.01)
     motion = np.column_stack([(both[0] + both[1]) / 2.0, turn])
     first = np.diff(chain, prepend=-1) > 0

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from probe2road.fleet import Fleet
+from probe2road.fleet import Fleet, fix_intervals
 
 __all__ = ["rows_of_points", "screen_drives"]
 
@@ -57,7 +57,7 @@ def screen_drives(fleet: Fleet) -> NDArray[np.str_]:
     dx, dy = (np.diff(traces[axis].to_numpy(), prepend=np.nan) for axis in "xy")
     step = np.hypot(dx, dy)
     step[starts[:-1]] = np.nan
-    interval = _seconds(traces["t"])
+    interval = fix_intervals(traces["t"])
     speed = traces["speed"].to_numpy(np.float64) if "speed" in traces else np.full(len(step), np.nan)
     jump = _jumps(step, interval, speed)
     jumps, steps = _sum(jump, owner, fleet.n_traces), np.maximum(np.diff(starts) - 1, 1)
@@ -166,12 +166,6 @@ def _points_are_wrong(fleet: Fleet) -> NDArray[np.bool_]:
     total = np.bincount(drive[known], minlength=fleet.n_traces)
     strays = np.bincount(drive[known], weights=stray[known], minlength=fleet.n_traces)
     return strays > _STRAY_POINTS * np.maximum(total, 1)
-
-
-def _seconds(times: pd.Series) -> NDArray[np.float64]:
-    """Seconds since the fix before; NaN where there is none or no clock."""
-    time = times.to_numpy(dtype="datetime64[ns]")
-    return np.asarray(np.diff(time, prepend=np.datetime64("NaT", "ns")) / np.timedelta64(1, "s"), np.float64)
 
 
 def _milliseconds(times: pd.Series) -> NDArray[np.int64]:

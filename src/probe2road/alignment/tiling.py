@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe2road.alignment.area import AlignedArea, align_area
-from probe2road.alignment.keyframes import wrapped
 from probe2road.alignment.options import AlignOptions
+from probe2road.alignment.reckoning import wrapped
 from probe2road.alignment.screening import rows_of_points
 from probe2road.fleet import Fleet
 from probe2road.workers import in_processes
