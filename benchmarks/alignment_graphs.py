@@ -52,7 +52,7 @@ def versions(recording: Recording, aligned: Path | None) -> Iterator[tuple[str, 
     yield "raw", read_fleet_files(recording.drives)
     if aligned:
         yield "aligned", read_fleet_files(aligned)
-    yield "modelled", read_fleet_files(recording.aligned)
+    yield "modelled", read_fleet_files(recording.modelled)
     yield "true", at_true_poses(read_fleet_files(recording.drives), recording.poses)
 
 

@@ -87,7 +87,7 @@ def report(name: str, recording: Recording, pictures: Path | None) -> None:
     )
     columns = [f"{NAMES[metric]} F1/P/R" for metric in METRICS]
     print(f"| fleet data | built | s | against | {' | '.join(columns)} |\n|---|---|---|---|{'---|' * len(columns)}")
-    for source, path in (("aligned", recording.aligned), ("raw", recording.drives)):
+    for source, path in (("aligned", recording.modelled), ("raw", recording.drives)):
         fleet = read_fleet(path, points_path(path))
         made = timed_build(name, source, fleet)
         for against, truth in ((f"{MIN_DRIVES} drives", driven), ("all", reference)):

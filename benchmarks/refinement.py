@@ -2,7 +2,7 @@
 
 Usage: python benchmarks/refinement.py FOLDER [NAMES...] [--segmenter network] [--work WORK] [--pictures docs/img]
 
-FOLDER holds the data sets that `probe2road benchmark prepare` made. Graphs are built from the aligned fleet data, or
+FOLDER holds the data sets that `probe2road benchmark prepare` made. Graphs are built from the modelled fleet data, or
 are those that `probe2road benchmark run --poses modelled --work WORK` kept from before the refinement. Scores are
 against the reference kept where at least four drives pass. Prints Markdown.
 """
@@ -58,7 +58,7 @@ def main() -> None:
     arguments = parser.parse_args()
     for name in arguments.names:
         folder = arguments.folder / name
-        fleet = read_fleet(folder / "aligned.parquet", folder / "aligned.points.parquet")
+        fleet = read_fleet(folder / "modelled.parquet", folder / "modelled.points.parquet")
         reference = labelled_reference(read_graph(folder / "reference.gpkg"))
         print(f"\n## {name}\n\n| step | GEO F1/P/R | iTOPO F1/P/R | TOPO F1 | nodes | km | s |\n|{'---|' * 7}")
         done = rows(fleet, arguments.segmenter, kept(arguments.work, name, arguments.segmenter))

@@ -46,7 +46,7 @@ def main() -> None:
     check_dataset(arguments.folder)
     recording = Recording(arguments.folder)
     tiles = chosen_tiles(read_tiles(arguments.folder), arguments.tiles)
-    fleet = read_fleet(recording.aligned)
+    fleet = read_fleet(recording.modelled)
     truth = labelled_reference(read_graph(recording.reference), min_drives=4)
     parts = [(within(fleet, tile), split_area(tile, "train")) for tile in (tiles.iloc[[k]] for k in range(len(tiles)))]
     logger.info("| settings | GEO F1/P/R | iTOPO F1/P/R |\n|---|---|---|")

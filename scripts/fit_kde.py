@@ -45,7 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="the prepared data set")
     parser.add_argument("--tiles", type=int, default=8, help="training tiles to use")
-    parser.add_argument("--raw", action="store_true", help="use the raw instead of the aligned fleet data")
+    parser.add_argument("--raw", action="store_true", help="use the raw instead of the modelled fleet data")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     logger.setLevel(logging.INFO)
@@ -53,7 +53,7 @@ def main() -> None:
     recording = Recording(arguments.folder)
     tiles = chosen_tiles(read_tiles(arguments.folder), arguments.tiles)
     area = split_area(tiles, "train")
-    fleet = within(read_fleet(recording.drives if arguments.raw else recording.aligned), tiles)
+    fleet = within(read_fleet(recording.drives if arguments.raw else recording.modelled), tiles)
     truth = labelled_reference(read_graph(recording.reference), min_drives=4)
     logger.info(
         "%d traces, %d fixes; %.1f km of roads",

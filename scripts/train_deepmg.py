@@ -55,7 +55,7 @@ def prepare(dataset: Path, output: Path, config: Config) -> tuple[TileSet, TileS
     """Return the tiles for training and validation, from an earlier call where they are complete."""
     folders = {split: output / f"tiles-{split}" for split in ("train", "validation")}
     if not all(folder.is_dir() for folder in folders.values()):
-        steps = thin_traces(read_fleet(dataset / "aligned.parquet"), config.features)
+        steps = thin_traces(read_fleet(dataset / "modelled.parquet"), config.features)
         reference = labelled_reference(read_graph(dataset / "reference.gpkg"), min_drives=config.min_drives)
         squares = gpd.read_file(dataset / "tiles.gpkg")
         for split, folder in folders.items():

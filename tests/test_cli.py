@@ -152,10 +152,10 @@ ROADS = """<osm version="0.6">
 
 def test_simulate_writes_fleet_data_that_build_reads_and_the_truth(folder, call):
     (folder / "roads.osm").write_text(ROADS)
-    code, _, err = call("simulate", "roads.osm", "--drives", 4, "--seed", 1, "--aligned", "-o", "fleet")
+    code, _, err = call("simulate", "roads.osm", "--drives", 4, "--seed", 1, "--modelled", "-o", "fleet")
     assert code == 0, err
     assert {path.name for path in (folder / "fleet").iterdir()} == {
-        *("drives.parquet", "drives.points.parquet", "aligned.parquet", "aligned.points.parquet", "poses.parquet"),
+        *("drives.parquet", "drives.points.parquet", "modelled.parquet", "modelled.points.parquet", "poses.parquet"),
         *("routes.parquet", "reference.gpkg", "run.json"),
     }
     assert read_graph(folder / "fleet" / "reference.gpkg").edges["support"].tolist() == [4]
@@ -193,7 +193,7 @@ def test_benchmark_prepare_makes_a_data_set_of_generated_roads(folder, call, mon
         (["simulate", "roads.osm", "--drives", 1, "--kilometres", 1, "-o", "x"], "pass --drives or --kilometres"),
         (["simulate", "roads.osm", "--drives", 0, "-o", "x"], "give one, above 0"),
         (["simulate", "roads.osm", "--drives", 1, "--preset", "sunny", "-o", "x"], "preset 'sunny' is unknown"),
-        (["simulate", "roads.osm", "--drives", 1, "--preset", "phone", "--aligned", "-o", "x"], "no camera"),
+        (["simulate", "roads.osm", "--drives", 1, "--preset", "phone", "--modelled", "-o", "x"], "no camera"),
         (["simulate", "absent.osm", "--drives", 1, "-o", "x"], "no such file"),
         (["simulate", "roads.osm", "--drives", 1, "-o", "."], "not empty and not a recording"),
         (["benchmark", "prepare", "atlantis", "-o", "x"], "there is no data set 'atlantis'"),

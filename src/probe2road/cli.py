@@ -310,7 +310,7 @@ def simulate(
     seed: Annotated[int, typer.Option(help="The same seed makes the same fleet.")] = 0,
     drives: Annotated[int | None, typer.Option(help="How many drives.")] = None,
     kilometres: Annotated[float | None, typer.Option(help="How many kilometres in all, instead of drives.")] = None,
-    aligned: Annotated[bool, typer.Option("--aligned", help="Also write what an alignment would leave.")] = False,
+    modelled: Annotated[bool, typer.Option("--modelled", help="Also write what an alignment would leave.")] = False,
     workers: Annotated[int, typer.Option(help="Processes; no influence on the result.")] = 1,
 ) -> None:
     """Simulate a vehicle fleet on a road network: raw fleet data, true poses, and the true road graph.
@@ -334,7 +334,7 @@ def simulate(
             drive_km=kilometres,
             seed=seed,
             workers=workers,
-            residual=ResidualModel() if aligned else None,
+            residual=ResidualModel() if modelled else None,
             progress=progress,
         )
 

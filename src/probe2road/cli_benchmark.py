@@ -35,6 +35,26 @@ def prepare(
 
 
 @benchmark.command()
+def align(
+    sets: Annotated[Path, typer.Argument(help="Folder of prepared data sets.")],
+    names: Annotated[
+        list[str] | None, typer.Option("--name", help="Data set or group; all cities without any.")
+    ] = None,
+    workers: Annotated[int, typer.Option(help="Processes; no influence on the result beyond millimetres.")] = 1,
+) -> None:
+    """Align the raw fleets of data sets, and keep the aligned ones beside them.
+
+    An interrupted run goes on where it stopped when it is started again; what is aligned is taken as it is.
+    """
+    from probe2road.benchmark.aligning import align_dataset
+    from probe2road.benchmark.datasets import find_datasets
+
+    with progress_bar() as progress:
+        for data in find_datasets(names or []):
+            typer.echo(align_dataset(sets / data.name, workers=workers, progress=progress))
+
+
+@benchmark.command()
 def run(
     sets: Annotated[Path, typer.Argument(help="Folder of prepared data sets.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for tables, cells and pictures.")],

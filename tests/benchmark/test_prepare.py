@@ -112,11 +112,11 @@ def test_generated_sets_need_no_extract_and_carry_no_notice(tmp_path, monkeypatc
     assert stages[-1] == ("town-2: km", 4, 4)
 
 
-def test_a_variant_without_camera_has_no_aligned_data(tmp_path):
+def test_a_variant_without_camera_has_no_modelled_data(tmp_path):
     phone = replace(find_dataset("corridor-1-phone"), drive_km=4.0)
     made = prepare_dataset(phone, tmp_path / "phone", data="")
-    assert not made.aligned.exists()
-    assert "aligned" not in (made.folder / "README.md").read_text()
+    assert not made.modelled.exists()
+    assert "modelled" not in (made.folder / "README.md").read_text()
 
 
 def test_definitions_are_distinct_and_groups_name_them():

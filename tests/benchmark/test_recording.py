@@ -55,8 +55,8 @@ def test_files_hold_the_fleet_that_is_simulated_in_memory(fork, recorded, whole)
     assert pd.read_parquet(recorded.routes).equals(whole.routes)
 
 
-def test_aligned_files_hold_what_an_alignment_leaves(fork, recorded, whole):
-    fleet = read_fleet(recorded.aligned, points_path(recorded.aligned), target_crs=fork.crs)
+def test_modelled_files_hold_what_an_alignment_leaves(fork, recorded, whole):
+    fleet = read_fleet(recorded.modelled, points_path(recorded.modelled), target_crs=fork.crs)
     traces, points = align_drives(whole.fleet.traces, whole.fleet.points, whole.poses, ALIGNED, seed=4)
     pd.testing.assert_frame_equal(fleet.traces[traces.columns], traces)
     pd.testing.assert_frame_equal(fleet.points[points.columns], points)

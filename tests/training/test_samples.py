@@ -35,7 +35,7 @@ def place(scene):
 
 def test_a_square_shows_what_build_would_see_and_what_the_benchmark_scores_against(scene, sets):
     recording = Recording(sets / DATASET)
-    fleet = read_fleet(recording.aligned, points_path(recording.aligned))
+    fleet = read_fleet(recording.modelled, points_path(recording.modelled))
     x, y = scene.origin + place(scene)
     grid = Grid(x - 64, y + 64, 1.0, 128, 128, fleet.crs)
     drawn = square(scene, place(scene), replace(PLAIN, label_width=1))
@@ -124,7 +124,7 @@ def test_a_scene_is_kept_and_made_anew_when_its_origin_changes(scene, tmp_path):
 
 def test_your_own_fleet_and_reference(sets, tmp_path):
     recording = Recording(sets / DATASET)
-    own = Source("mine", fleet=str(recording.aligned), reference=str(recording.reference))
+    own = Source("mine", fleet=str(recording.modelled), reference=str(recording.reference))
     scene, truth = open_scene(own, tmp_path), open_scene(Source(DATASET), sets)
     drawn = square(scene, place(truth), replace(PLAIN, label_width=5))
     known = square(truth, place(truth), replace(PLAIN, label_width=1))
@@ -140,7 +140,7 @@ def test_clear_errors(sets, tmp_path):
     with pytest.raises(OptionError, match="there is no rotation 'some'"):
         SampleOptions(rotation="some")
     fleet = fleet_from_tables(
-        read_fleet(Recording(sets / DATASET).aligned).traces, crs="EPSG:32632", target_crs="EPSG:32632"
+        read_fleet(Recording(sets / DATASET).modelled).traces, crs="EPSG:32632", target_crs="EPSG:32632"
     )
     reference = read_graph(Recording(sets / DATASET).reference).to_crs("EPSG:32631")
     with pytest.raises(InputError, match="reproject one of them"):

@@ -164,7 +164,7 @@ def _fitted(
     return np.column_stack([fitted.real, fitted.imag])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _running_median(
     values: NDArray[np.float64], seconds: NDArray[np.float64], chain: NDArray[np.int64]
 ) -> NDArray[np.float64]:

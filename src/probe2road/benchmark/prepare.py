@@ -103,7 +103,7 @@ def prepare_dataset(
     data, workers, progress
         As in `prepare`.
     residual
-        Errors of the aligned fleet data; the defaults where not given. A fleet without camera has none.
+        Errors of the modelled fleet data; the defaults where not given. A fleet without camera has none.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def prepare_dataset(
     ...     made = prepare_dataset(tiny, Path(parent, "tiny"), data="")
     ...     check_dataset(made.folder)
     ...     sorted(path.name for path in made.folder.iterdir())[:4]
-    ['README.md', 'aligned.parquet', 'aligned.points.parquet', 'drives.parquet']
+    ['README.md', 'drives.parquet', 'drives.points.parquet', 'manifest.json']
     """
     folder = Path(folder)
     network = load_network(definition, data)
@@ -214,15 +214,15 @@ def _readme(definition: Dataset, recording: Recording) -> str:
         if definition.generated
         else f"{OSM_NOTICE}\n\nThe roads, and with them this data set, are a derivative database under that licence."
     )
-    aligned = "" if not recording.aligned.exists() else (
-        "* `aligned.parquet`, `aligned.points.parquet`: the same after an alignment, with its residual errors\n"
+    modelled = "" if not recording.modelled.exists() else (
+        "* `modelled.parquet`, `modelled.points.parquet`: the same with the errors that an alignment leaves\n"
     )  # fmt: skip
     tiles = "* `tiles.gpkg`: tiles of 1 km by 1 km and their splits\n" if definition.splits else ""
     return (
         f"# {definition.name}\n\nSimulated fleet data of the probe2road benchmark: {definition.role}.\n"
         f"{counts['drives']:,} drives, {counts['km']:,.0f} km, preset {definition.preset}, seed {definition.seed}.\n\n"
         "* `drives.parquet`, `drives.points.parquet`: raw fleet data (the points only where there is a camera)\n"
-        f"{aligned}* `poses.parquet`: the true pose of every fix, in the same order\n"
+        f"{modelled}* `poses.parquet`: the true pose of every fix, in the same order\n"
         "* `routes.parquet`: the road sections that every drive drove\n"
         "* `reference.gpkg`: the true road graph; `support` is the true number of drives\n"
         f"{tiles}* `run.json`, `manifest.json`: how it was made, and checksums\n\n## Licence\n\n{licence}\n"

@@ -35,11 +35,14 @@ from probe2road.simulate.network import RoadNetwork
 from probe2road.simulate.presets import Preset, find_preset
 from probe2road.simulate.records import count_drives
 
-__all__ = ["RUN_FILE", "Recording", "record_fleet"]
+__all__ = ["POSES", "RUN_FILE", "Recording", "record_fleet"]
 
 logger = logging.getLogger(__name__)
 
 RUN_FILE = "run.json"
+
+# Poses that a fleet may have: from `probe2road align`, from the model of what an alignment leaves, or as recorded.
+POSES = ("aligned", "modelled", "raw")
 
 _FORMAT = 1  # raised when what a recording holds changes
 _PORTIONS = ".portions"
@@ -48,8 +51,8 @@ _DRIVES = 20  # drives in a portion: some 300 km, 600,000 points
 _FILES = {
     "traces": "drives.parquet",
     "points": "drives.points.parquet",
-    "aligned_traces": "aligned.parquet",
-    "aligned_points": "aligned.points.parquet",
+    "modelled_traces": "modelled.parquet",
+    "modelled_points": "modelled.points.parquet",
     "poses": "poses.parquet",
     "routes": "routes.parquet",
 }
@@ -68,9 +71,18 @@ class Recording:
         return self.folder / _FILES["traces"]
 
     @property
+    def modelled(self) -> Path:
+        """Traces with the errors that an alignment leaves; absent where they were not asked for."""
+        return self.folder / _FILES["modelled_traces"]
+
+    @property
     def aligned(self) -> Path:
-        """Aligned traces; absent where no alignment was asked for."""
-        return self.folder / _FILES["aligned_traces"]
+        """Traces as `probe2road.benchmark.aligning.align_dataset` leaves them; absent before."""
+        return self.folder / "aligned.parquet"
+
+    def traces(self, poses: str) -> Path:
+        """Traces with some of `POSES`."""
+        return {"aligned": self.aligned, "modelled": self.modelled, "raw": self.drives}[poses]
 
     @property
     def poses(self) -> Path:
@@ -132,7 +144,7 @@ def record_fleet(
     -------
     Recording
         ``drives.parquet`` and ``drives.points.parquet`` (raw fleet data, which `probe2road.read_fleet` reads),
-        ``aligned.parquet`` and ``aligned.points.parquet``, ``poses.parquet``, ``routes.parquet``,
+        ``modelled.parquet`` and ``modelled.points.parquet``, ``poses.parquet``, ``routes.parquet``,
         ``reference.gpkg``, ``run.json``. The last is written last.
 
     Raises
@@ -259,8 +271,8 @@ def _write_portion(chunk: FleetChunk, path: Path, residual: ResidualModel | None
     """Write one portion as a folder that is complete or absent."""
     tables = {name: getattr(chunk, name) for name in ("traces", "points", "poses", "routes")}
     if residual is not None:
-        aligned = align_drives(chunk.traces, chunk.points, chunk.poses, residual, seed=seed)
-        tables |= {"aligned_traces": aligned[0], "aligned_points": aligned[1]}
+        traces, points = align_drives(chunk.traces, chunk.points, chunk.poses, residual, seed=seed)
+        tables |= {"modelled_traces": traces, "modelled_points": points}
     boxes = {}
     with atomic_path(path) as temporary:
         temporary.mkdir()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import shutil
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,9 +14,10 @@ import pyarrow.parquet as pq
 import shapely
 from numpy.typing import NDArray
 
+from probe2road.benchmark.aligning import align_dataset
 from probe2road.benchmark.datasets import find_dataset
 from probe2road.benchmark.prepare import check_dataset, read_tiles
-from probe2road.benchmark.recording import Recording
+from probe2road.benchmark.recording import POSES, Recording
 from probe2road.benchmark.reference import labelled_reference
 from probe2road.benchmark.tiles import SPLITS, split_area
 from probe2road.errors import InputError, OptionError
@@ -27,12 +27,9 @@ from probe2road.io.fleet_reader import read_fleet_files
 from probe2road.io.fleet_writer import write_fleet
 from probe2road.roadgraph import RoadGraph
 
-__all__ = ["POSES", "Source", "choose_drives", "make_fleet"]
+__all__ = ["Source", "choose_drives", "make_fleet"]
 
 logger = logging.getLogger(__name__)
-
-# Poses that a fleet may have: from `probe2road align`, from the model of what an alignment leaves, or as recorded.
-POSES = ("aligned", "modelled", "raw")
 
 _SEED = 64
 
@@ -89,10 +86,8 @@ class Source:
     @property
     def fleet_file(self) -> Path:
         """Traces of the fleet; `make_fleet` makes what the data set does not have."""
-        if self.drives is None and self.poses == "raw":
-            return Recording(self.folder).drives
-        if self.drives is None and self.poses == "modelled":
-            return Recording(self.folder).aligned
+        if self.drives is None:
+            return Recording(self.folder).traces(self.poses)
         return self.place / "fleet.parquet"
 
 
@@ -109,23 +104,17 @@ def make_fleet(source: Source) -> None:
     path = source.fleet_file
     if path.exists():
         return
-    if source.drives is None and source.poses != "aligned":
-        raise InputError("the data set has no such fleet", where=path, fix="prepare it again, or choose other poses")
-    path.parent.mkdir(parents=True, exist_ok=True)
     if source.drives is not None:
         whole = replace(source, drives=None)
         make_fleet(whole)
         routes = pq.read_table(Recording(source.folder).routes).to_pandas()
         chosen = choose_drives(routes, source.drives, rng=np.random.default_rng(_SEED))
+        path.parent.mkdir(parents=True, exist_ok=True)
         write_fleet(_of_drives(read_fleet_files(whole.fleet_file), chosen), path)
-        return
-    from probe2road.align import align  # needs the extra
-
-    logger.info("aligning the raw fleet of %s", source.name)
-    workspace = path.parent / "alignment"
-    aligned = align(read_fleet_files(Recording(source.folder).drives), workspace=workspace)
-    write_fleet(aligned.fleet, path)
-    shutil.rmtree(workspace, ignore_errors=True)
+    elif source.poses == "aligned":
+        align_dataset(source.folder)
+    else:
+        raise InputError("the data set has no such fleet", where=path, fix="prepare it again, or choose other poses")
 
 
 def choose_drives(routes: pd.DataFrame, most: int, *, rng: np.random.Generator) -> NDArray[np.int64]:

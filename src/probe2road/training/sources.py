@@ -13,7 +13,7 @@ import shapely
 
 from probe2road.benchmark.datasets import find_datasets
 from probe2road.benchmark.prepare import read_tiles
-from probe2road.benchmark.recording import Recording
+from probe2road.benchmark.recording import POSES, Recording
 from probe2road.benchmark.reference import labelled_reference
 from probe2road.benchmark.tiles import split_area
 from probe2road.errors import InputError, OptionError
@@ -36,7 +36,7 @@ class Source:
 
     name: str = "columbus"  # of a data set or a group of the benchmark, or what to call your own
     split: str = ""  # of the data set; all of it where empty
-    data: str = "aligned"  # "aligned" or "raw", of a data set
+    data: str = "modelled"  # of a data set: one of POSES
     fleet: str = ""  # fleet data of your own, read by `probe2road.read_fleet`
     points: str = ""  # its semantic points, where they are another file
     reference: str = ""  # centrelines of your own, a graph file
@@ -47,8 +47,8 @@ class Source:
         if self.name == "" or bool(self.fleet) != bool(self.reference):
             fix = "give the name of a data set, or a name, a fleet and a reference"
             raise OptionError("names nothing to learn from", where="source", fix=fix)
-        if self.data not in ("aligned", "raw") or self.weight < 0:
-            fix = "use aligned or raw, and a weight of 0 or more"
+        if self.data not in POSES or self.weight < 0:
+            fix = f"use {', '.join(POSES)}, and a weight of 0 or more"
             raise OptionError(f"data is {self.data!r}, weight is {self.weight}", where=f"source {self.name}", fix=fix)
 
 
@@ -126,8 +126,7 @@ def _make(source: Source, sets: Path) -> Scene:
         pieces, driven = label_pieces(read_graph(source.reference).to_crs(fleet.crs), fleet, LabelOptions())
         return make_scene(fleet, pieces, driven)
     recording = _recording(source, sets)
-    path = recording.aligned if source.data == "aligned" else recording.drives
-    fleet = read_fleet_files(path)
+    fleet = read_fleet_files(recording.traces(source.data))
     driven = pd.read_parquet(recording.routes).rename(columns={"section": "edge"})
     area = split_area(read_tiles(recording.folder), source.split) if source.split else None
     return make_scene(fleet, read_graph(recording.reference), driven, area=area)
@@ -146,7 +145,11 @@ def _files(source: Source, sets: str | Path) -> list[Path]:
     """List the files that decide whether a scene is still that of its source."""
     if source.fleet:
         return [Path(path) for path in (source.fleet, source.points, source.reference) if path]
-    return [_recording(source, sets).folder / "manifest.json"]
+    recording = _recording(source, sets)
+    if source.data == "aligned" and not recording.aligned.exists():
+        fix = f"run probe2road benchmark align {sets} --name {source.name}"
+        raise InputError("the data set is not aligned", where=recording.folder, fix=fix)
+    return [recording.aligned if source.data == "aligned" else recording.folder / "manifest.json"]
 
 
 def _changed(path: Path) -> int:
