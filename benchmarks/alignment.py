@@ -2,10 +2,10 @@
 
     python benchmarks/alignment.py sets/columbus --area 327000 4424000 329000 4425500 --every 4
     python benchmarks/alignment.py --simulate open_sky --area 327000 4424000 329000 4425500 --km 120
-    python benchmarks/alignment.py sets/boston --aligned boston.parquet sets/boston/aligned.parquet
+    python benchmarks/alignment.py sets/boston --aligned sets/boston/aligned.parquet sets/boston/modelled.parquet
 
 The first form aligns a part of a prepared data set, the second one drives the Columbus network in that area anew and
-aligns that, and the third one scores files that `probe2road align` wrote, or the aligned data of the set, as a whole.
+aligns that, and the third one scores files that `probe2road align` wrote, or the modelled data of the set, as a whole.
 Prints, before and after: the error of trajectories (root mean square, m), the median lateral error, the same where 15
 drives or more pass, the median error along, the robust standard deviation between the drives at a place (25 m of one
 road) of the lateral, the longitudinal and the vertical error, the share of drives of which more than half is nearer to

@@ -4,7 +4,7 @@
 
 Each version of the fleet is built with the default options of `probe2road.build` and scored against the roads that at
 least four drives passed. "true" is the raw fleet moved to its true poses, its points moved rigidly with them: what
-alignment could give at best, with the errors that the camera has of its own. "modelled" is the aligned data of the set,
+alignment could give at best, with the errors that the camera has of its own. "modelled" is the model of one in the set,
 true poses with the residual errors of `probe2road.benchmark.residual`. Prints one line of a Markdown table for each.
 """
 

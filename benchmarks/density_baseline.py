@@ -3,7 +3,7 @@
 Usage: probe2road benchmark prepare boston hannover tokyo_shibuya columbus milan --output SETS
        python benchmarks/density_baseline.py SETS [--names boston,...] [--pictures docs/img]
 
-Prints the Markdown tables of docs/results/density-baseline.md. Every set is built from raw and from aligned fleet
+Prints the Markdown tables of docs/results/density-baseline.md. Every set is built from raw and from modelled fleet
 data, with the default options but without refinement, and scored against the roads that at least four drives
 passed and against all. Columbus is scored in its test tiles only.
 """
@@ -57,7 +57,7 @@ class Built:
     """A graph and what it took."""
 
     name: str
-    source: str  # "raw" or "aligned"
+    source: str  # "raw" or "modelled"
     graph: RoadGraph
     seconds: float
 
@@ -75,7 +75,7 @@ def main() -> None:
 
 
 def report(name: str, recording: Recording, pictures: Path | None) -> None:
-    """Build a set from raw and from aligned data, print its table, draw its picture."""
+    """Build a set from raw and from modelled data, print its table, draw its picture."""
     reference = read_graph(recording.reference)
     driven = labelled_reference(reference, min_drives=MIN_DRIVES)
     area = split_area(read_tiles(recording.folder), "test") if DATASETS[name].splits else None
@@ -87,7 +87,7 @@ def report(name: str, recording: Recording, pictures: Path | None) -> None:
     )
     columns = [f"{NAMES[metric]} F1/P/R" for metric in METRICS]
     print(f"| fleet data | built | s | against | {' | '.join(columns)} |\n|---|---|---|---|{'---|' * len(columns)}")
-    for source, path in (("aligned", recording.modelled), ("raw", recording.drives)):
+    for source, path in (("modelled", recording.modelled), ("raw", recording.drives)):
         fleet = read_fleet(path, points_path(path))
         made = timed_build(name, source, fleet)
         for against, truth in ((f"{MIN_DRIVES} drives", driven), ("all", reference)):
@@ -95,7 +95,7 @@ def report(name: str, recording: Recording, pictures: Path | None) -> None:
             print(
                 f"| {source} | {km(made.graph, area):.1f} km | {made.seconds:.0f} | {against} | {' | '.join(scores)} |"
             )
-        if pictures is not None and source == "aligned":
+        if pictures is not None and source == "modelled":
             draw_tiles(recording, reference, pictures)
             draw(name, fleet, reference, made.graph, pictures / f"benchmark-{name}.png")
 

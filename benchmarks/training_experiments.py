@@ -4,8 +4,9 @@ Usage: probe2road benchmark prepare columbus rhein_neckar porto milan interchang
        python benchmarks/training_experiments.py SETS RESULTS.json [--steps 800] [--names base,width_1,...]
 
 Prints a Markdown table of docs/results/segmentation.md. Results are kept in RESULTS.json run by run; a run that is
-there already is not repeated. Every run has the same seed, samples, steps and learning rates. What is not in the
-shipped configuration lives here only, until it proves worth it.
+there already is not repeated. Every run has the same samples, steps and learning rates, and the seed of the
+configuration unless another one is given. What is not in the shipped configuration lives here only, until it proves
+worth it.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ class Variation:
     label_width: int = 3
     fine: bool = False  # whether the decoder also gets what was seen at half and at full resolution
     keypoints: bool = False  # whether a second output learns to mark junctions
+    data: str = "modelled"  # poses of the fleets learned from, where they are not raw
     turns: int = 1  # right angles by which squares are turned in validation, the results averaged
     weights: str = ""  # name of the run whose weights are used; trained anew where empty
 
@@ -84,6 +86,7 @@ def main() -> None:
     parser.add_argument("results", type=Path, help="JSON file to add to")
     parser.add_argument("--steps", type=int, default=800)
     parser.add_argument("--names", default=",".join(VARIATIONS), help="comma-separated")
+    parser.add_argument("--seed", type=int, help="in place of that of the configuration; use another RESULTS.json")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -92,21 +95,41 @@ def main() -> None:
         if name not in results:
             variation = VARIATIONS[name]
             weights = options.results.with_name(f"{options.results.stem}-{variation.weights or name}.pt")
-            results[name] = run(variation, options.sets, options.steps, weights)
+            results[name] = run(variation, options.sets, options.steps, weights, seed=options.seed)
             options.results.write_text(json.dumps(results, indent=1))
             print(name, results[name], flush=True)
-    print("\n| run | soft F1 | GEO F1/P/R | iTOPO F1 | million parameters | s a step |\n|---|---|---|---|---|---|")
+    print("\n| run | soft F1 | GEO F1/P/R | iTOPO F1 | million parameters | s a step | s a tile |")
+    print("|---|---|---|---|---|---|---|")
     for name, row in results.items():
         print(
             f"| {VARIATIONS[name].what} | {row['soft_f1']:.3f} | {row['geo_f1']:.3f}/{row['geo_precision']:.3f}/"
-            f"{row['geo_recall']:.3f} | {row['itopo_f1']:.3f} | {row['parameters'] / 1e6:.1f} | {row['seconds']:.2f} |"
+            f"{row['geo_recall']:.3f} | {row['itopo_f1']:.3f} | {row['parameters'] / 1e6:.1f} | {row['seconds']:.2f} | "
+            f"{tile_seconds(VARIATIONS[name]):.2f} |"
         )
 
 
-def run(variation: Variation, sets: Path, steps: int, weights: Path) -> dict[str, float]:
+def tile_seconds(variation: Variation) -> float:
+    """Seconds of processor time that a prediction of 1024 x 1024 pixels takes, in single precision."""
+    channels = len(variation.rows) + (0 if variation.extra is None else 2)  # more input channels cost next to nothing
+    kind = FineDLinkNet if variation.fine else DLinkNet
+    network = kind(variation.architecture, channels=channels, classes=1 + variation.keypoints)
+    network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    x = torch.rand(1, channels, 1024, 1024).to(memory_format=torch.channels_last)
+    spent = []
+    for _ in range(3):
+        started = time.process_time()
+        with torch.inference_mode():
+            network(x)
+        spent.append(time.process_time() - started)
+    return variation.turns * min(spent)
+
+
+def run(variation: Variation, sets: Path, steps: int, weights: Path, *, seed: int | None) -> dict[str, float]:
     """Train, unless there are weights already, and validate."""
     config = replace(load_config("gnss-vision"), steps=steps)
-    scenes = [(open_scene(source, sets), source.weight) for source in members(config.sources)]
+    config = config if seed is None else replace(config, seed=seed)
+    sources = [replace(one, data=variation.data) if one.data == "modelled" else one for one in config.sources]
+    scenes = [(open_scene(source, sets), source.weight) for source in members(sources)]
     torch.manual_seed(config.seed)
     channels = len(network_channels(variation, square_vectors(scenes[0][0], (0.0, 0.0), SampleOptions(size=32))))
     kind = FineDLinkNet if variation.fine else DLinkNet
@@ -293,6 +316,7 @@ VARIATIONS = {
     "heading_mean": Variation("and mean cosine and sine of the heading", extra=heading_mean),
     "heading_bins": Variation("and eight channels of heading", extra=heading_bins),
     "altitude": Variation("and three channels of altitude layers", extra=altitude_layers),
+    "aligned": Variation("fleets by `probe2road align`", data="aligned"),
     "keypoints": Variation("and a second output for junctions", keypoints=True),
     "turned": Variation("predictions averaged over four right angles", turns=4, weights="base"),
     "fine_1": Variation("skip connections at full and half resolution, labels of 1 pixel", fine=True, label_width=1),

@@ -44,7 +44,7 @@ RUN_FILE = "run.json"
 # Poses that a fleet may have: from `probe2road align`, from the model of what an alignment leaves, or as recorded.
 POSES = ("aligned", "modelled", "raw")
 
-_FORMAT = 1  # raised when what a recording holds changes
+_FORMAT = 2  # raised when what a recording holds changes
 _PORTIONS = ".portions"
 _DRIVES = 20  # drives in a portion: some 300 km, 600,000 points
 # Table of a portion to the file that the tables of all portions become.
