@@ -4,8 +4,9 @@ Usage: probe2road benchmark run SETS --output TABLES --work WORK --poses modelle
        python benchmarks/worst_places.py SETS/boston WORK/boston-modelled/probe2road/stages docs/img/worst-boston.png
 
 Every point on either graph, 5 m apart, that is farther than 6 m from the other graph counts for its square of 200 m.
-The squares with most of them are drawn: the probability on the left, and the graph (orange; red dots are dead ends,
-black dots junctions) over the reference (grey) on the right. Prints what the squares hold.
+With `--junctions` every junction and dead end counts that is farther than 15 m from all of the other graph. The squares
+with most of them are drawn: the probability above, and the graph (orange; red dots are dead ends, black dots junctions)
+over the reference (grey) below. Prints what the squares hold.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from probe2road import read_graph
 from probe2road.benchmark.reference import labelled_reference
 from probe2road.roadgraph import RoadGraph
 
-SPACING, RADIUS = 5.0, 6.0  # m
+SPACING, RADIUS = 5.0, 6.0  # m, of points on roads
+NODE_RADIUS = 15.0  # m
 SQUARE = 200.0  # m
 COLUMNS = 5
 
@@ -39,26 +41,38 @@ def main() -> None:
     parser.add_argument("workspace", type=Path, help="of a finished build")
     parser.add_argument("picture", type=Path)
     parser.add_argument("--places", type=int, default=10)
+    parser.add_argument("--junctions", action="store_true", help="count junctions and dead ends in place of roads")
     options = parser.parse_args()
     reference = labelled_reference(read_graph(options.dataset / "reference.gpkg"))
     graph = read_graph(options.workspace / "7-roads.gpkg")
+    apart, worth, unit = (nodes_apart, 1.0, "") if options.junctions else (roads_apart, SPACING, " m")
     missed, extra = apart(reference, graph), apart(graph, reference)
     squares, count = np.unique(np.floor(np.concatenate([missed, extra]) / SQUARE), axis=0, return_counts=True)
     worst = squares[np.argsort(-count, kind="stable")[: options.places]]
     for number, square in enumerate(worst, start=1):
         lost, added = (
-            SPACING * np.count_nonzero((np.floor(points / SQUARE) == square).all(axis=1)) for points in (missed, extra)
+            worth * np.count_nonzero((np.floor(points / SQUARE) == square).all(axis=1)) for points in (missed, extra)
         )
         x, y = (square + 0.5) * SQUARE
-        print(f"| {number} | {x:.0f}, {y:.0f} | {lost:.0f} m | {added:.0f} m |")
+        print(f"| {number} | {x:.0f}, {y:.0f} | {lost:.0f}{unit} | {added:.0f}{unit} |")
     draw(worst, reference, graph, options.workspace / "1-probability.tif", options.picture)
 
 
-def apart(graph: RoadGraph, other: RoadGraph) -> NDArray[np.float64]:
+def roads_apart(graph: RoadGraph, other: RoadGraph) -> NDArray[np.float64]:
     """Points on a graph that are far from another: shape ``(n, 2)``."""
-    lines = shapely.segmentize(graph.edges.geometry.to_numpy(), SPACING)
-    xy = shapely.get_coordinates(lines)
-    near = shapely.STRtree(other.edges.geometry.to_numpy()).query(shapely.points(xy), "dwithin", distance=RADIUS)[0]
+    xy = shapely.get_coordinates(shapely.segmentize(graph.edges.geometry.to_numpy(), SPACING))
+    return far_from(xy, other.edges.geometry.to_numpy(), RADIUS)
+
+
+def nodes_apart(graph: RoadGraph, other: RoadGraph) -> NDArray[np.float64]:
+    """Junctions and dead ends of a graph that are far from those of another: shape ``(n, 2)``."""
+    own, others = (each.nodes.geometry.to_numpy()[each.degrees().to_numpy() != 2] for each in (graph, other))
+    return far_from(shapely.get_coordinates(own), others, NODE_RADIUS)
+
+
+def far_from(xy: NDArray[np.float64], shapes: NDArray[np.object_], radius: float) -> NDArray[np.float64]:
+    """Those of some points that no shape is near."""
+    near = shapely.STRtree(shapes).query(shapely.points(xy), "dwithin", distance=radius)[0]
     far = np.ones(len(xy), bool)
     far[near] = False
     return xy[far]

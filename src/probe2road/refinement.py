@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from probe2road.braids import BraidOptions, open_braids
 from probe2road.centreline import CentrelineOptions, refine_centreline
 from probe2road.clean import CleanOptions, clean_graph
 from probe2road.disambiguate import DisambiguateOptions, split_false_junctions
@@ -40,6 +41,7 @@ class RefineOptions:
     min_support: int | None = None  # traces that must drive on an edge for it to stay; 0 keeps all, None is as for move
     rungs: RungOptions = field(default_factory=RungOptions)  # which edges need more than min_support
     junctions: DisambiguateOptions = field(default_factory=DisambiguateOptions)  # which junctions are split
+    braids: BraidOptions = field(default_factory=BraidOptions)  # which chains of edges are roads side by side
     forks: ForkOptions = field(default_factory=ForkOptions)  # which forks are moved to where traces part
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)  # what counts as having driven an edge
     move: bool | None = None  # whether edges move to the middle of what was driven; None: see `for_segmenter`
@@ -133,6 +135,9 @@ def refine_graph(
             graph = clean_graph(driven, clean)
             matches = match(fleet, graph, options.matching)
     report("matching", 5, 6)
+    opened = open_braids(graph, matches.steps, options=options.braids)
+    if opened is not graph:
+        graph, matches = opened, match(fleet, opened, options.matching)
     moved = move_forks(graph, fleet, matches, options=options.forks)
     if moved is not graph:
         graph, matches = moved, match(fleet, moved, options.matching)
