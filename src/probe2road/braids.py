@@ -27,12 +27,12 @@ from scipy.ndimage import uniform_filter1d
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
-from shapely.ops import substring
 
 from probe2road.clean import merge_degree_two_nodes
 from probe2road.errors import OptionError
 from probe2road.roadgraph import RoadGraph, finish_edges
-from probe2road.topology import end_nodes
+from probe2road.splitting import led_to
+from probe2road.topology import directions_away, end_nodes
 
 __all__ = ["BraidOptions", "open_braids"]
 
@@ -147,7 +147,7 @@ def _chains(
     """Yield the sets of two joints and more that short edges connect, from which edges lead to two sides."""
     node = end_nodes(u, v)
     n = len(places)
-    angle = _directions(lines)
+    angle = np.arctan2(*directions_away(lines, _NEAR, _FAR).T[::-1])
     # Opposite directions are one line: of the doubled angles the mean is taken.
     sums = [np.bincount(node, wave(2.0 * angle), n) for wave in (np.sin, np.cos)]
     aside = np.abs((angle - np.arctan2(*sums)[node] / 2.0 + np.pi / 2.0) % np.pi - np.pi / 2.0)
@@ -169,20 +169,6 @@ def _chains(
         side = (to_last < to_first).astype(np.int64)
         if 0 < side.sum() < len(side):
             yield _Chain(nodes, np.unique(own[inner[own // 2]] // 2), away, side)
-
-
-def _directions(lines: NDArray[np.object_]) -> NDArray[np.float64]:
-    """Direction in which each end leads away from its node, radians, shape (2 E,)."""
-    length = shapely.length(lines)
-    far = np.minimum(_FAR, 0.9 * length)
-    near = np.minimum(_NEAR, 0.5 * far)
-    here, there = (
-        shapely.get_coordinates(
-            shapely.line_interpolate_point(lines[:, None], np.stack([at, length - at], axis=1)).ravel()
-        )
-        for at in (near, far)
-    )
-    return np.arctan2(*(there - here).T[::-1])
 
 
 def _roads(
@@ -329,7 +315,8 @@ class _Changes:
         if shapely.has_z(graph.nodes.geometry.to_numpy()).any():
             points = shapely.force_3d(points, np.nan)
         for row in np.flatnonzero((self._target >= 0).any(axis=1)):
-            lines[row] = _led_to(lines[row], [points[goal] if goal >= 0 else None for goal in self._target[row]])
+            cuts = np.where(self._target[row] >= 0, min(_TRIM, _MAX_CUT * lines[row].length), 0.0)
+            lines[row] = led_to(lines[row], cuts, [points[goal] if goal >= 0 else None for goal in self._target[row]])
         uv = np.where(self._target >= 0, self._target + free, graph.edges[["u", "v"]].to_numpy())
         kept = graph.edges.assign(u=uv[:, 0], v=uv[:, 1], geometry=lines)
         kept = kept.drop(index=graph.edges.index[np.concatenate([chain.inner for chain in self.chains])])
@@ -340,14 +327,3 @@ class _Changes:
         nodes = gpd.GeoDataFrame(geometry=points, index=ids, crs=graph.crs)
         nodes = pd.concat([graph.nodes.drop(index=gone), nodes]).rename_axis("node")
         return replace(graph, nodes=nodes, edges=finish_edges(pd.concat([kept, new])), turns=graph.turns.iloc[:0])
-
-
-def _led_to(line: shapely.LineString, goals: list[shapely.Point | None]) -> shapely.LineString:
-    """Cut a line where it has been bent, and lead it to new ends; heights at the ends stay."""
-    cut = [min(_TRIM, _MAX_CUT * line.length) if goal is not None else 0.0 for goal in goals]
-    kept = list(substring(line, cut[0], line.length - cut[1]).coords)
-    for goal, at in zip(goals, (0, len(kept)), strict=True):
-        if goal is not None:
-            nearest = kept[min(at, len(kept) - 1)]
-            kept.insert(len(kept) if at else 0, (goal.x, goal.y, *nearest[2:]))
-    return shapely.LineString(kept)

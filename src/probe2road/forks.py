@@ -34,7 +34,7 @@ from probe2road.errors import OptionError
 from probe2road.fleet import Fleet
 from probe2road.mapmatch import Matches
 from probe2road.roadgraph import RoadGraph, finish_edges
-from probe2road.topology import end_nodes
+from probe2road.topology import directions_away, end_nodes
 
 __all__ = ["ForkOptions", "Forks", "find_forks", "move_forks"]
 
@@ -155,16 +155,7 @@ def find_forks(graph: RoadGraph, *, max_angle: float = ForkOptions.max_angle) ->
     >>> forks.node.tolist(), forks.stem.tolist(), forks.branch.tolist()
     ([1], [1], [[2, 4]])
     """
-    lines = shapely.force_2d(graph.edges.geometry.to_numpy())
-    length = shapely.length(lines)
-    far = np.minimum(_FAR, 0.9 * length)
-    near = np.minimum(_NEAR, 0.5 * far)
-    along = [np.stack([at, length - at], axis=1) for at in (near, far)]
-    here, there = (
-        shapely.get_coordinates(shapely.line_interpolate_point(lines[:, None], at).reshape(-1)) for at in along
-    )
-    ahead = (there - here) / np.maximum(np.hypot(*(there - here).T), 1e-9)[:, None]  # (2 E, 2)
-
+    ahead = directions_away(graph.edges.geometry.to_numpy(), _NEAR, _FAR)
     row = graph.nodes.index.get_indexer(end_nodes(graph.edges["u"].to_numpy(), graph.edges["v"].to_numpy()))
     order = np.argsort(row, kind="stable")
     node, first, count = np.unique(row[order], return_index=True, return_counts=True)

@@ -15,7 +15,7 @@ from shapely.ops import substring
 from probe2road.passages import Places
 from probe2road.roadgraph import RoadGraph, finish_edges
 
-__all__ = ["open_artefacts", "split_edges", "split_nodes"]
+__all__ = ["led_to", "open_artefacts", "split_edges", "split_nodes"]
 
 _TRIM = (5.0, 20.0)  # m; least and most that is cut off a road beside an artefact, where thinning has bent it
 _MAX_CUT = 0.4  # of an edge
@@ -189,7 +189,7 @@ def open_artefacts(
     cuts[end // 2, end % 2], target[end // 2, end % 2] = cut, node
     for row in np.unique(end // 2):
         goals = [new.geometry[goal] if goal >= 0 else None for goal in target[row]]
-        lines[row] = _led_to(lines[row], cuts[row], goals)
+        lines[row] = led_to(lines[row], cuts[row], goals)
     uv = np.where(target >= 0, target, graph.edges[["u", "v"]].to_numpy())
     old = graph.edges[["u", "v"]].to_numpy()[np.unique(inner)].ravel()
     edges = graph.edges.assign(u=uv[:, 0], v=uv[:, 1], geometry=lines)
@@ -198,9 +198,7 @@ def open_artefacts(
     return replace(graph, nodes=nodes, edges=finish_edges(edges))
 
 
-def _led_to(
-    line: shapely.LineString, cut: NDArray[np.float64], goals: list[shapely.Point | None]
-) -> shapely.LineString:
+def led_to(line: shapely.LineString, cut: NDArray[np.float64], goals: list[shapely.Point | None]) -> shapely.LineString:
     """Cut lengths off both ends of a line and lead it to points, where there are any; heights at the ends stay."""
     kept = list(substring(line, cut[0], line.length - cut[1]).coords)
     for goal, at in zip(goals, (0, len(kept)), strict=True):
