@@ -2,9 +2,9 @@
 
 Usage: python benchmarks/refinement.py FOLDER [NAMES...] [--segmenter network] [--work WORK] [--pictures docs/img]
 
-FOLDER holds the data sets that `probe2road benchmark prepare` made. Graphs are built from the modelled fleet data, or
-are those that `probe2road benchmark run --poses modelled --work WORK` kept from before the refinement. Scores are
-against the reference kept where at least four drives pass. Prints Markdown.
+FOLDER holds the data sets that `probe2road benchmark prepare` and `align` made. Graphs are built from the aligned fleet
+data, or are those that `probe2road benchmark run --work WORK` kept from before the refinement. Scores are against the
+reference kept where at least four drives pass. `--poses modelled` takes the modelled data. Prints Markdown.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from probe2road.benchmark.recording import POSES, Recording
 from probe2road.benchmark.reference import labelled_reference
+from probe2road.braids import open_braids
 from probe2road.centreline import refine_centreline
 from probe2road.clean import clean_graph
 from probe2road.crs import WGS84, transform
@@ -25,6 +27,7 @@ from probe2road.fleet import Fleet
 from probe2road.forks import move_forks
 from probe2road.gaps import fill_gaps, fill_jumps, gap_weights, prune_gaps
 from probe2road.io.fleet_reader import read_fleet
+from probe2road.io.fleet_writer import points_path
 from probe2road.mapmatch import match
 from probe2road.metrics import evaluate
 from probe2road.passages import passing_positions
@@ -53,15 +56,17 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", default=CITIES)
     parser.add_argument("--segmenter", default="density", choices=("density", "network"))
+    parser.add_argument("--poses", default="aligned", choices=POSES)
     parser.add_argument("--work", type=Path, help="folder that benchmark run kept its work in")
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the densest interchanges")
     arguments = parser.parse_args()
     for name in arguments.names:
         folder = arguments.folder / name
-        fleet = read_fleet(folder / "modelled.parquet", folder / "modelled.points.parquet")
+        path = Recording(folder).traces(arguments.poses)
+        fleet = read_fleet(path, points_path(path))
         reference = labelled_reference(read_graph(folder / "reference.gpkg"))
         print(f"\n## {name}\n\n| step | GEO F1/P/R | iTOPO F1/P/R | TOPO F1 | nodes | km | s |\n|{'---|' * 7}")
-        done = rows(fleet, arguments.segmenter, kept(arguments.work, name, arguments.segmenter))
+        done = rows(fleet, arguments.segmenter, kept(arguments.work, f"{name}-{arguments.poses}", arguments.segmenter))
         for row in done:
             print(line(row, reference), flush=True)
         for number, place in enumerate(PLACES.get(name, ())) if arguments.pictures else ():
@@ -80,7 +85,7 @@ def around(place: tuple[float, float], fleet: Fleet) -> tuple[float, float, floa
 def kept(work: Path | None, name: str, segmenter: str) -> RoadGraph | None:
     """Return the graph that a run of the benchmark had before the refinement."""
     method = {"network": "probe2road", "density": "density"}[segmenter]
-    return read_graph(work / f"{name}-modelled" / method / "stages" / "5-cleaned.gpkg") if work else None
+    return read_graph(work / name / method / "stages" / "5-cleaned.gpkg") if work else None
 
 
 def rows(fleet: Fleet, segmenter: str, built: RoadGraph | None) -> list[Row]:
@@ -120,6 +125,9 @@ def rows(fleet: Fleet, segmenter: str, built: RoadGraph | None) -> list[Row]:
         graph = clean_graph(drop_undriven(graph, matches.steps, rungs=RungOptions()))
         matches = match(fleet, graph)
     note("split and dropped again", graph)
+    graph = open_braids(graph, matches.steps)
+    matches = match(fleet, graph)
+    note("braids opened", graph)
     graph = move_forks(graph, fleet, matches)
     note("forks moved", graph)
     if segmenter == "density":
