@@ -26,9 +26,11 @@ from scipy import ndimage
 from torch import Tensor, nn
 from torch.nn import functional
 
-from probe2road.segmentation.dlinknet import ARCHITECTURES, Architecture, DLinkNet
+from probe2road.raster import CHANNELS
+from probe2road.segmentation.dlinknet import ARCHITECTURES, STRIDE, Architecture, DLinkNet
+from probe2road.segmentation.export_onnx import export
 from probe2road.segmentation.losses import LossOptions, bce_dice, loss_function
-from probe2road.segmentation.weights import network_input
+from probe2road.segmentation.weights import ModelInfo, network_input
 from probe2road.training.config import TrainConfig, load_config
 from probe2road.training.loop import learning_rate
 from probe2road.training.samples import SampleOptions, Vectors, sample_vectors, square_vectors
@@ -88,6 +90,7 @@ def main() -> None:
     parser.add_argument("--names", default=",".join(VARIATIONS), help="comma-separated")
     parser.add_argument("--seed", type=int, help="in place of that of the configuration; use another RESULTS.json")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--export", action="store_true", help="write weights files beside the results, for build")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     results = json.loads(options.results.read_text()) if options.results.exists() else {}
@@ -98,6 +101,8 @@ def main() -> None:
             results[name] = run(variation, options.sets, options.steps, weights, seed=options.seed)
             options.results.write_text(json.dumps(results, indent=1))
             print(name, results[name], flush=True)
+        if options.export:
+            write_weights(name, options.results.with_name(f"{options.results.stem}-{name}.pt"))
     print("\n| run | soft F1 | GEO F1/P/R | iTOPO F1 | million parameters | s a step | s a tile |")
     print("|---|---|---|---|---|---|---|")
     for name, row in results.items():
@@ -143,6 +148,16 @@ def run(variation: Variation, sets: Path, steps: int, weights: Path, *, seed: in
         torch.save(network.state_dict(), weights)
     parameters = sum(parameter.numel() for parameter in network.parameters())
     return {**scores(network, variation, config, sets), "parameters": parameters, "seconds": seconds, "steps": steps}
+
+
+def write_weights(name: str, weights: Path) -> None:
+    """Write the network of a run as a weights file that `probe2road build` takes."""
+    variation = VARIATIONS[name]
+    channels = tuple(CHANNELS[row] for row in variation.rows)
+    network = DLinkNet(variation.architecture, channels=len(channels))
+    network.load_state_dict(torch.load(weights, weights_only=True))
+    info = ModelInfo(name, channels, tile=512, stride=STRIDE, training={"experiment": variation.what})
+    export(network, info, weights.with_suffix(".onnx"))
 
 
 def learn(network: nn.Module, variation: Variation, config: TrainConfig, scenes: list[tuple[Scene, float]]) -> float:
