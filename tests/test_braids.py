@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 from probe2road.braids import BraidOptions, open_braids
-from probe2road.errors import OptionError
+from probe2road.errors import InputError, OptionError
 from probe2road.roadgraph import RoadGraph, graph_from_lines
 
 CRS = "EPSG:32616"
@@ -116,6 +116,11 @@ def test_the_order_of_edges_does_not_matter() -> None:
     )
     for line, same in zip(one, other, strict=True):
         assert line.normalize().equals_exact(same.normalize(), 1e-6)
+
+
+def test_steps_of_another_graph_are_refused() -> None:
+    with pytest.raises(InputError, match="edge 99 of the steps"):
+        open_braids(graph_from_lines(BRAID, crs=CRS), driven([(99, True)]))
 
 
 def test_negative_numbers_are_refused() -> None:

@@ -29,7 +29,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from probe2road.clean import merge_degree_two_nodes
-from probe2road.errors import OptionError
+from probe2road.errors import InputError, OptionError
 from probe2road.roadgraph import RoadGraph, finish_edges
 from probe2road.splitting import led_to
 from probe2road.topology import directions_away, end_nodes
@@ -92,6 +92,15 @@ def open_braids(graph: RoadGraph, steps: pd.DataFrame, *, options: BraidOptions 
         Edges that no chain had a part in keep ids and attributes; new ones have the attributes of its longest edge.
         Nodes of degree 2 are merged. All turns are dropped: match again. The graph itself where there was no chain.
 
+    Raises
+    ------
+    InputError
+        If the steps name an edge that is not in the graph.
+
+    Notes
+    -----
+    Not in the paper; docs/decisions/0013-false-junctions.md says what it gave.
+
     Examples
     --------
     Two carriageways 6 m apart whose lines touch for 60 m:
@@ -131,6 +140,9 @@ def open_braids(graph: RoadGraph, steps: pd.DataFrame, *, options: BraidOptions 
 def _flows(graph: RoadGraph, steps: pd.DataFrame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Count, for every end of an edge, the traces that drive towards its node and away from it: (2 E,) each."""
     row = graph.edges.index.get_indexer(steps["edge"])
+    if (row < 0).any():
+        fault = f"edge {steps['edge'].to_numpy()[row < 0][0]} of the steps is not in the graph"
+        raise InputError(fault, where="open_braids", fix="pass the graph that was matched on")
     forward = steps["forward"].to_numpy(bool)
     n = len(graph.edges)
     ahead, back = (np.bincount(row[way], minlength=n) for way in (forward, ~forward))
@@ -203,8 +215,7 @@ def _middle(
         return None
     count = max(round(way.length / _STEP), 2) + 1
     points = shapely.get_coordinates(way.interpolate(np.linspace(0.0, 1.0, count), normalized=True))
-    ahead = np.gradient(points, axis=0)
-    normal = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.hypot(*ahead.T)[:, None]
+    normal = _normals(points)
     # The way goes by one side of a lens: it is moved to the middle between what lies outermost on either side.
     every = shapely.get_coordinates(shapely.segmentize(lines[chain.inner], _STEP))
     near = cKDTree(points).query(every)[1]
@@ -253,16 +264,21 @@ def _offsets(
         return np.zeros(2)
     (came, went), (back_came, back_went) = roads
     offset = []
-    for one, other, ahead in ((came, back_went, middle[1] - middle[0]), (went, back_came, middle[-1] - middle[-2])):
+    for one, other, normal in zip((came, went), (back_went, back_came), _normals(middle)[[0, -1]], strict=True):
         own = _beside(lines[one // 2], one % 2)
         nearest = shapely.line_interpolate_point(lines[other // 2], shapely.line_locate_point(lines[other // 2], own))
         away = shapely.get_coordinates(own) - shapely.get_coordinates(nearest)
-        normal = np.array([-ahead[1], ahead[0]]) / np.hypot(*ahead)
         offset.append(float(np.median(away @ normal)) / 2.0)
     apart = 2.0 * np.abs(offset)
     if offset[0] * offset[1] <= 0 or apart.max() > options.max_width:
         return None
     return np.array(offset)
+
+
+def _normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Point to the left along a line: unit vectors, shape (m, 2)."""
+    ahead = np.gradient(points, axis=0)
+    return np.asarray(np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.hypot(*ahead.T)[:, None])
 
 
 def _beside(line: shapely.LineString, end: int) -> NDArray[np.object_]:
@@ -294,11 +310,9 @@ class _Changes:
         """Put one line a road in the place of a chain."""
         self.chains.append(chain)
         longest = chain.inner[self.graph.edges["length"].to_numpy()[chain.inner].argmax()]
-        ahead = np.gradient(middle, axis=0)
-        normal = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.hypot(*ahead.T)[:, None]
-        offset = np.interp(np.linspace(0.0, 1.0, len(middle)), [0.0, 1.0], left)[:, None]
+        aside = np.linspace(left[0], left[1], len(middle))[:, None] * _normals(middle)
         for (came, went), sign in zip(roads, (1.0, -1.0), strict=False):
-            line = middle + sign * offset * normal
+            line = middle + sign * aside
             line = line if sign > 0 else line[::-1]
             first = len(self._places)
             self._places += [line[0], line[-1]]
