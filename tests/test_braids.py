@@ -94,6 +94,13 @@ def test_roads_far_apart_are_none(subtests: Any) -> None:
             assert open_braids(graph, driven(*EASTWARDS, *WESTWARDS), options=options) is graph
 
 
+def test_a_long_stretch_counts_where_both_directions_share_it() -> None:
+    longer = [[(x + 150 if x > 20 else x, y) for x, y in line] for line in BRAID]
+    graph, steps = graph_from_lines(longer, crs=CRS), driven(*EASTWARDS, *WESTWARDS)
+    assert len(open_braids(graph, steps).edges) == 2
+    assert open_braids(graph, steps, options=BraidOptions(max_shared=100.0)) is graph
+
+
 def test_all_else_keeps_its_ids_and_lines() -> None:
     crossing = [[(-300, 500), (0, 520)], [(0, 520), (300, 500)], [(0, 520), (0, 700)]]
     graph = graph_from_lines([*crossing, *BRAID], crs=CRS)

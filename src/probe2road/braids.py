@@ -51,6 +51,7 @@ class BraidOptions:
     """Which chains of short edges are taken for roads side by side."""
 
     max_inner: float = 100.0  # m; longer edges between two joints are roads of their own; 0 opens nothing
+    max_shared: float = 300.0  # m; the same for edges that are driven in both directions
     max_angle: float = 30.0  # degrees between an edge at a joint and the line that all edges there lie along
     max_width: float = 16.0  # m between the outermost lines of a chain, and between the roads that lead to it
     min_traces: int = 3  # that drive in, and out, by the edges that lead to a chain
@@ -122,7 +123,11 @@ def open_braids(graph: RoadGraph, steps: pd.DataFrame, *, options: BraidOptions 
     u, v = (graph.nodes.index.get_indexer(graph.edges[end]).astype(np.int64) for end in ("u", "v"))
     into, out = _flows(graph, steps)
     changed = _Changes(graph)
-    for chain in _chains(lines, u, v, shapely.get_coordinates(graph.nodes.geometry.to_numpy()), options):
+    ways = out.reshape(-1, 2)  # forwards, backwards
+    shared = ways.min(axis=1) >= np.maximum(options.min_traces, (1.0 - options.min_share) * ways.sum(axis=1))
+    longest = np.where(shared, options.max_shared, options.max_inner)
+    short = shapely.length(lines) <= longest
+    for chain in _chains(lines, u, v, short, shapely.get_coordinates(graph.nodes.geometry.to_numpy()), options):
         roads = _roads(chain, into[chain.ends], out[chain.ends], options)
         middle = _middle(chain, roads, lines, u, v) if roads else None
         if middle is None or _width(lines[chain.inner], middle) > options.max_width:
@@ -153,6 +158,7 @@ def _chains(
     lines: NDArray[np.object_],
     u: NDArray[np.int64],
     v: NDArray[np.int64],
+    short: NDArray[np.bool_],
     places: NDArray[np.float64],
     options: BraidOptions,
 ) -> Iterator[_Chain]:
@@ -166,7 +172,7 @@ def _chains(
     worst = np.zeros(n)
     np.maximum.at(worst, node, aside)
     joint = (np.bincount(node, minlength=n) >= 3) & (worst <= np.radians(options.max_angle))
-    inner = (shapely.length(lines) <= options.max_inner) & joint[u] & joint[v]
+    inner = short & joint[u] & joint[v]
     links = coo_array((np.ones(inner.sum()), (u[inner], v[inner])), shape=(n, n))
     part = connected_components(links, directed=False)[1]
     size = np.bincount(part, minlength=n)
