@@ -58,7 +58,8 @@ class Variation:
     label_width: int = 3
     fine: bool = False  # whether the decoder also gets what was seen at half and at full resolution
     keypoints: bool = False  # whether a second output learns to mark junctions
-    data: str = "modelled"  # poses of the fleets learned from, where they are not raw
+    data: str = "modelled"  # poses of the cities and corridors learned from, where they are not raw
+    validated: str = "modelled"  # poses of the fleet validated on
     turns: int = 1  # right angles by which squares are turned in validation, the results averaged
     weights: str = ""  # name of the run whose weights are used; trained anew where empty
 
@@ -133,7 +134,15 @@ def run(variation: Variation, sets: Path, steps: int, weights: Path, *, seed: in
     """Train, unless there are weights already, and validate."""
     config = replace(load_config("gnss-vision"), steps=steps)
     config = config if seed is None else replace(config, seed=seed)
-    sources = [replace(one, data=variation.data) if one.data == "modelled" else one for one in config.sources]
+    (validated,) = config.validation.sources
+    validation = replace(config.validation, sources=(replace(validated, data=variation.validated),))
+    config = replace(config, validation=validation)
+    # Interchanges stay modelled: there are twenty, and to align them takes as long as a city.
+    learned = [one.data == "modelled" and one.name != "interchanges" for one in config.sources]
+    sources = [
+        replace(one, data=variation.data) if chosen else one
+        for one, chosen in zip(config.sources, learned, strict=True)
+    ]
     scenes = [(open_scene(source, sets), source.weight) for source in members(sources)]
     torch.manual_seed(config.seed)
     channels = len(network_channels(variation, square_vectors(scenes[0][0], (0.0, 0.0), SampleOptions(size=32))))
@@ -331,7 +340,9 @@ VARIATIONS = {
     "heading_mean": Variation("and mean cosine and sine of the heading", extra=heading_mean),
     "heading_bins": Variation("and eight channels of heading", extra=heading_bins),
     "altitude": Variation("and three channels of altitude layers", extra=altitude_layers),
-    "aligned": Variation("fleets by `probe2road align`", data="aligned"),
+    "aligned": Variation("cities and corridors aligned by `align`", data="aligned"),
+    "base_on_aligned": Variation("as shipped, validated on aligned data", validated="aligned", weights="base"),
+    "aligned_on_aligned": Variation("aligned, validated on aligned data", validated="aligned", weights="aligned"),
     "keypoints": Variation("and a second output for junctions", keypoints=True),
     "turned": Variation("predictions averaged over four right angles", turns=4, weights="base"),
     "fine_1": Variation("skip connections at full and half resolution, labels of 1 pixel", fine=True, label_width=1),

@@ -169,4 +169,4 @@ def test_amount_is_given_once_and_positive(fork, tmp_path, amount):
 
 
 def test_run_file_is_plain_json(recorded):
-    assert json.loads((recorded.folder / "run.json").read_text())["format"] == 1
+    assert json.loads((recorded.folder / "run.json").read_text())["format"] == 2

@@ -170,7 +170,8 @@ def project_nodes(
     """Find, for each node, the closest position on another network within the radius.
 
     Where several edges are as close as the closest, to within ``options.tie``, the one that makes the smallest
-    angle with a branch of the node is taken, then the lowest: at stacked roads distance alone decides nothing.
+    angle with a branch of the node is taken, then one that ends there, then the lowest: at stacked roads distance
+    alone decides nothing.
 
     Returns
     -------
@@ -195,7 +196,8 @@ def project_nodes(
     tied = gap <= closest[row] + options.tie
     row, candidate, along, direction = row[tied], candidate[tied], along[tied], direction[tied]
     angle = _angle_to_branches(network, nodes[row], direction, options.branch)
-    order = np.lexsort((candidate, np.round(angle, 6), row))
+    passes = np.minimum(along, other.length[candidate] - along) > EPSILON
+    order = np.lexsort((candidate, passes, np.round(angle, 6), row))
     kept = order[np.unique(row[order], return_index=True)[1]]
     edge[row[kept]], offset[row[kept]] = candidate[kept], along[kept]
     return edge, offset
