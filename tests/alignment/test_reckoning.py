@@ -93,5 +93,7 @@ def test_a_drive_through_reflections_is_aligned_nearer_to_the_truth(rng: np.rand
     fleet = with_burst(fleet, slice(100, 108), 80.0)
     result = align(fleet)
     assert result.report.drives["status"].tolist() == ["by path"]
+    moved = np.hypot(*(result.fleet.traces[["x", "y"]].to_numpy() - fleet.traces[["x", "y"]].to_numpy()).T)
+    assert result.report.drives["shift"].iloc[0] == pytest.approx(np.median(moved))
     assert away(result.fleet, true).max() < 8.0
     assert np.median(away(result.fleet, true)) < np.median(away(fleet, true))
