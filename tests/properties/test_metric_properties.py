@@ -40,6 +40,7 @@ def graph(lines: list[Any]) -> RoadGraph:
 @given(street_lines())
 @example([[(0.0, 0.0), (0.0, 20.0), (0.0, 40.0)], [(0.0, 0.0), (0.0, 40.0), (0.0, 80.0)]])  # one upon the other
 @example([[(0.0, 0.0), (0.0, 60.0), (0.0, 120.0)], [(0.0, 40.0), (0.0, 60.0), (0.0, 80.0)]])  # one within the other
+@example([[(40.0, 0.0), (40.0, 60.0), (40.0, 120.0)], [(40.0, 40.0), (40.0, 61.25909373815464), (40.0, 80.0)]])
 def test_a_graph_against_itself_scores_one(lines: list[Any]) -> None:
     table = evaluate(graph(lines), graph(lines), metrics=CHEAP)
     assert table["f1"].to_numpy() == pytest.approx(1.0)

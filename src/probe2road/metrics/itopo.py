@@ -197,7 +197,8 @@ def project_nodes(
     row, candidate, along, direction = row[tied], candidate[tied], along[tied], direction[tied]
     angle = _angle_to_branches(network, nodes[row], direction, options.branch)
     passes = np.minimum(along, other.length[candidate] - along) > EPSILON
-    order = np.lexsort((candidate, passes, np.round(angle, 6), row))
+    # Cosines near 1 give angles to no more than some 1e-6 degrees.
+    order = np.lexsort((candidate, passes, np.round(angle, 4), row))
     kept = order[np.unique(row[order], return_index=True)[1]]
     edge[row[kept]], offset[row[kept]] = candidate[kept], along[kept]
     return edge, offset
