@@ -158,13 +158,13 @@ def _align(
     usable = reasons == ""
     owner = np.repeat(np.arange(fleet.n_traces), np.diff(fleet.starts))
     touched = (usable & ~held)[owner]
-    steady = np.where(touched[:, None], steadying(fleet), 0.0)
-    fleet = moved_fleet(fleet, np.pad(steady, ((0, 0), (0, 2))))
+    steady = np.zeros((len(owner), 4))
+    steady[touched, :2] = steadying(fleet)[touched]
+    fleet = moved_fleet(fleet, steady)
     tiles = find_tiles(fleet, options, touched=touched if held.any() else None)
     kept = open_workspace(folder, fleet, _Run(options, int(held.sum())))
     moves = align_tiles(fleet, usable, tiles, options, held=held, workspace=kept, workers=workers, progress=progress)
-    moved = replace(moves, shift=moves.shift + np.pad(steady, ((0, 0), (0, 2))))
-    report = make_report(fleet, reasons, held, moved)
+    report = make_report(fleet, reasons, held, replace(moves, shift=moves.shift + steady))
     # Held drives do not move, not even by what rounding leaves.
     shift = np.where(touched[:, None], moves.shift, 0.0)
     result = moved_fleet(fleet, shift)

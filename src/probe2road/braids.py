@@ -29,7 +29,8 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from probe2road.clean import merge_degree_two_nodes
-from probe2road.errors import InputError, OptionError
+from probe2road.errors import OptionError
+from probe2road.passages import step_rows
 from probe2road.roadgraph import RoadGraph, finish_edges
 from probe2road.splitting import led_to
 from probe2road.topology import directions_away, end_nodes
@@ -121,9 +122,9 @@ def open_braids(graph: RoadGraph, steps: pd.DataFrame, *, options: BraidOptions 
         return graph
     lines = shapely.force_2d(graph.edges.geometry.to_numpy())
     u, v = (graph.nodes.index.get_indexer(graph.edges[end]).astype(np.int64) for end in ("u", "v"))
-    into, out = _flows(graph, steps)
+    ways = _ways(graph, steps)
+    out, into = ways.ravel(), ways[:, ::-1].ravel()  # of every end: away from its node, towards it
     changed = _Changes(graph)
-    ways = out.reshape(-1, 2)  # forwards, backwards
     shared = ways.min(axis=1) >= np.maximum(options.min_traces, (1.0 - options.min_share) * ways.sum(axis=1))
     longest = np.where(shared, options.max_shared, options.max_inner)
     short = shapely.length(lines) <= longest
@@ -142,16 +143,11 @@ def open_braids(graph: RoadGraph, steps: pd.DataFrame, *, options: BraidOptions 
     return merge_degree_two_nodes(changed.made())
 
 
-def _flows(graph: RoadGraph, steps: pd.DataFrame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Count, for every end of an edge, the traces that drive towards its node and away from it: (2 E,) each."""
-    row = graph.edges.index.get_indexer(steps["edge"])
-    if (row < 0).any():
-        fault = f"edge {steps['edge'].to_numpy()[row < 0][0]} of the steps is not in the graph"
-        raise InputError(fault, where="open_braids", fix="pass the graph that was matched on")
-    forward = steps["forward"].to_numpy(bool)
-    n = len(graph.edges)
-    ahead, back = (np.bincount(row[way], minlength=n) for way in (forward, ~forward))
-    return np.column_stack([back, ahead]).ravel(), np.column_stack([ahead, back]).ravel()
+def _ways(graph: RoadGraph, steps: pd.DataFrame) -> NDArray[np.int64]:
+    """Count how often each edge is driven forwards and backwards, shape (E, 2)."""
+    row = step_rows(graph, steps, where="open_braids")
+    backwards = ~steps["forward"].to_numpy(bool)
+    return np.bincount(2 * row + backwards, minlength=2 * len(graph.edges)).reshape(-1, 2)
 
 
 def _chains(

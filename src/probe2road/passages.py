@@ -32,6 +32,7 @@ __all__ = [
     "passing_positions",
     "places_around",
     "places_at_nodes",
+    "step_rows",
 ]
 
 _FAR = 60.0  # m; between two fixes farther apart, positions are not interpolated
@@ -161,10 +162,7 @@ def node_passages(graph: RoadGraph, steps: pd.DataFrame, positions: pd.DataFrame
     InputError
         If the steps name an edge that is not in the graph.
     """
-    row = graph.edges.index.get_indexer(steps["edge"])
-    if (row < 0).any():
-        fault = f"edge {steps['edge'].to_numpy()[row < 0][0]} of the steps is not in the graph"
-        raise InputError(fault, where="node_passages", fix="pass the graph that was matched on")
+    row = step_rows(graph, steps, where="node_passages")
     forward = steps["forward"].to_numpy(bool)
     onto = np.flatnonzero(steps["entered"].to_numpy(bool))
     went = 2 * row + np.where(forward, 0, 1)
@@ -177,6 +175,21 @@ def node_passages(graph: RoadGraph, steps: pd.DataFrame, positions: pd.DataFrame
         xyz = known[[*"xyz"]].to_numpy(np.float64)
     trace = pd.factorize(steps["trace_id"])[0][onto]
     return Passages(node[went[onto]], came[onto - 1], went[onto], trace, xyz, onto)
+
+
+def step_rows(graph: RoadGraph, steps: pd.DataFrame, *, where: str) -> NDArray[np.int64]:
+    """Return the row of the edge of each step.
+
+    Raises
+    ------
+    InputError
+        If the steps name an edge that is not in the graph; ``where`` is who asks.
+    """
+    row = graph.edges.index.get_indexer(steps["edge"]).astype(np.int64)
+    if (row < 0).any():
+        fault = f"edge {steps['edge'].to_numpy()[row < 0][0]} of the steps is not in the graph"
+        raise InputError(fault, where=where, fix="pass the graph that was matched on")
+    return row
 
 
 def double_passages(
