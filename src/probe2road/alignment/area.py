@@ -111,11 +111,12 @@ def align_area(fleet: Fleet, options: AlignOptions, *, held: NDArray[np.bool_] |
     # Drives that were too far off to be found the first time are nearer the second time, on a map of all the others.
     for settled, gates in ((False, options.gates[:_TRIAL_ROUNDS]), (True, options.gates)):
         spines = find_spines(replace(frames, pose=pose), scene.chains.placing, options)
-        pose, floors, height = _register(scene, pose, spines, settled=settled)
-        pose, matches, rounds = _iterate(scene, pose, spines, floors, height, gates, robust_gnss=settled)
+        pose, floors, level = _register(scene, pose, spines, settled=settled)
+        pose, matches, rounds = _iterate(scene, pose, spines, floors, level, gates, robust_gnss=settled)
     on = project(spines, pose, options)
-    floor = floor_of(floors, on.cell, height, options)
-    z = solve_heights(frames, floor, spines.z[np.maximum(on.station, 0)], options, held=scene.held)
+    floor = floor_of(floors, on.cell, spines.above(on.station, level), options)
+    start = np.where(np.isfinite(level), level, frames.z)
+    z = solve_heights(frames, floor, spines.z[np.maximum(on.station, 0)], options, held=scene.held, start=start)
     return _result(scene, pose, z, spines, matches, rounds)
 
 
@@ -124,7 +125,7 @@ def _iterate(
     pose: NDArray[np.float64],
     spines: Spines,
     floors: Floors,
-    height: NDArray[np.float64],
+    level: NDArray[np.float64],
     gates: tuple[float, ...],
     *,
     robust_gnss: bool,
@@ -132,7 +133,7 @@ def _iterate(
     """Match and optimise in turn until the residuals stay as they are: poses, last matches, residual by round."""
     rounds: list[float] = []
     for gate in gates:
-        pose, matches = _round(scene, pose, spines, floors, height, gate, robust_gnss=robust_gnss)
+        pose, matches = _round(scene, pose, spines, floors, level, gate, robust_gnss=robust_gnss)
         rounds.append(float(np.median(np.abs(matches.residual))) if len(matches.residual) else 0.0)
         if len(rounds) > 1 and gate == min(gates) and abs(rounds[-2] - rounds[-1]) < scene.options.converged:
             break
@@ -161,24 +162,35 @@ def _points_on_spines(scene: _Scene, pose: NDArray[np.float64], spines: Spines) 
     return project(spines, world, scene.options)
 
 
+def _points_on_floors(
+    scene: _Scene, pose: NDArray[np.float64], spines: Spines, floors: Floors, level: NDArray[np.float64]
+) -> tuple[OnSpines, NDArray[np.int64]]:
+    """Project all points, and find the floor of each: as high above the spine as its keyframe, if that is on it."""
+    frame = scene.seen.keyframe
+    on, points = project(spines, pose, scene.options), _points_on_spines(scene, pose, spines)
+    alike = spines.cell_spine[points.cell] == spines.cell_spine[on.cell[frame]]
+    above = np.where(alike, spines.above(on.station, level)[frame], spines.above(points.station, level[frame]))
+    return points, floor_of(floors, points.cell, above, scene.options)
+
+
 def _register(
     scene: _Scene, pose: NDArray[np.float64], spines: Spines, *, settled: bool
 ) -> tuple[NDArray[np.float64], Floors, NDArray[np.float64]]:
-    """Bring drives onto one another, first in height, then across the road: poses, floors, heights over the spines."""
+    """Bring drives onto one another, first in height, then across the road: poses, floors, heights."""
     frames, options = scene.frames, scene.options
     on = project(spines, pose, options)
-    height = route_heights(frames, on, spines, options, held=scene.held)
-    floors = find_floors(on, height, spines, options)
-    home = floor_of(floors, on.cell, height, options)
+    level = route_heights(frames, on, spines, options, held=scene.held)
+    above = spines.above(on.station, level)
+    floors = find_floors(frames, on, above, spines, options)
+    home = floor_of(floors, on.cell, above, options)
     if len(scene.seen.keyframe) == 0 or len(floors.cell) == 0:
-        return pose, floors, height
+        return pose, floors, level
     if settled:
         angle = spines.station[np.maximum(on.station, 0), 2]
         pose = anchored(frames, pose, angle, home, floors.places, options, held=scene.held)
         on = project(spines, pose, options)
-        home = floor_of(floors, on.cell, height, options)
-    points = _points_on_spines(scene, pose, spines)
-    floor = floor_of(floors, points.cell, height[scene.seen.keyframe], options)
+        home = floor_of(floors, on.cell, spines.above(on.station, level), options)
+    points, floor = _points_on_floors(scene, pose, spines, floors, level)
     found = floor >= 0
     seen = Evidence(scene.seen.keyframe[found], floor[found], points.left[found], scene.seen.kind[found])
     angle = spines.station[np.maximum(on.station, 0), 2]
@@ -191,7 +203,7 @@ def _register(
         options.search, _SEARCH_BIN, options.search + 20.0, _SEARCH_KERNEL, _SEARCH_DOUBT, _SEARCH_TEMPER
     )
     shift = register(seen, floors.places, scene.chains, track, search, settled=settled)
-    return moved_aside(pose, angle, np.where(home >= 0, shift, 0.0)), floors, height
+    return moved_aside(pose, angle, np.where(home >= 0, shift, 0.0)), floors, level
 
 
 def _round(
@@ -199,15 +211,14 @@ def _round(
     pose: NDArray[np.float64],
     spines: Spines,
     floors: Floors,
-    height: NDArray[np.float64],
+    level: NDArray[np.float64],
     gate: float,
     *,
     robust_gnss: bool,
 ) -> tuple[NDArray[np.float64], Matches]:
     """Match points to lines and optimise: new poses, and the matches that led to them."""
     options, frame = scene.options, scene.seen.keyframe
-    points = _points_on_spines(scene, pose, spines)
-    floor = floor_of(floors, points.cell, height[frame], options)
+    points, floor = _points_on_floors(scene, pose, spines, floors, level)
     matches = match_lines(
         floor, points.along, points.left, scene.seen.kind, scene.frames.drive[frame], options, gate=gate
     )
@@ -218,7 +229,7 @@ def _round(
         matches, frame[at], patch[floor[at]], scene.seen.body[at],
         spines.station[points.station[at], 2] - pose[frame[at], 2], sigma, gate=gate,
     )  # fmt: skip
-    paths = _paths(scene, pose, spines, floors, height, np.unique(sights.keyframe))
+    paths = _paths(scene, pose, spines, floors, level, np.unique(sights.keyframe))
     both = Condensed(*(np.concatenate(pair) for pair in zip(_fields(sights), _fields(paths), strict=True)))
     held_patches = np.zeros(len(patch), bool)
     held_patches[patch[floor[at]][scene.held[frame[at]]]] = True
@@ -239,13 +250,13 @@ def _paths(
     pose: NDArray[np.float64],
     spines: Spines,
     floors: Floors,
-    height: NDArray[np.float64],
+    level: NDArray[np.float64],
     sighted: NDArray[np.int64],
 ) -> Condensed:
     """Attract drives whose camera saw nothing to the middle of all paths: weakly, because lanes differ."""
     options = scene.options
     on = project(spines, pose, options)
-    floor = floor_of(floors, on.cell, height, options)
+    floor = floor_of(floors, on.cell, spines.above(on.station, level), options)
     blind = floor >= 0
     chain = scene.frames.chain
     blind &= ~np.isin(chain, chain[sighted])

@@ -2,9 +2,11 @@
 
 Strategy
 --------
-Raw heights are off by metres, as much as two decks of a bridge are apart. Once drives that surely are on one road
-agree on its height (`probe2road.alignment.routes`), the heights at each place fall into groups with a gap between them,
-and every group is a floor. All later stages work on floors; a spine with two decks has two at each of its cells.
+Raw heights are off by metres, as much as two decks of a bridge are apart. Drives that surely are on one road are
+brought to one height first (`probe2road.alignment.routes`). Then heights at each place are joined, the nearest first,
+until the groups that are left lie further apart than the errors of so many drives explain: every group is a floor. A
+group is where its mean is; were gaps all that counts, a few drives between two decks would weld them. All later stages
+work on floors; a spine with two decks has two at each of its cells.
 """
 
 from __future__ import annotations
@@ -12,8 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from probe2road.alignment.heights import VERTICAL
+from probe2road.alignment.keyframes import Keyframes
 from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.profiles import Places
 from probe2road.alignment.spines import OnSpines, Spines
@@ -22,6 +27,8 @@ __all__ = ["Floors", "find_floors", "floor_of", "middles"]
 
 _LOOK_AHEAD = 4  # cells ahead of a keyframe in which it sees things, and one behind
 _FAR = 10_000.0  # m, more than any height
+_BIN = 0.25  # m; heights that are nearer are not told apart
+_DOUBT = 2.0  # sigmas of the difference of two groups within which they are one floor
 
 
 @dataclass(frozen=True)
@@ -39,37 +46,40 @@ class Floors:
         return np.where((self.cell % 2 == 1) & (self.places.before >= 0), self.places.before, own)
 
 
-def find_floors(on: OnSpines, height: NDArray[np.float64], spines: Spines, options: AlignOptions) -> Floors:
+def find_floors(
+    frames: Keyframes, on: OnSpines, height: NDArray[np.float64], spines: Spines, options: AlignOptions
+) -> Floors:
     """Group the heights at every cell.
 
     Parameters
     ----------
+    frames
+        The keyframes.
     on
-        Keyframes on the spines.
+        Where they are on the spines.
     height
         Of each keyframe above its spine, m; NaN where unknown. Shape ``(k,)``.
     spines
         The spines.
     options
-        Heights with a gap of more than the altitude gate between them are different floors.
+        Groups further apart than the altitude gate are different floors, unless so few drives may be wrong by that.
 
     Returns
     -------
     Floors
     """
-    usable = np.flatnonzero((on.cell >= 0) & np.isfinite(height))
-    reach = np.arange(-1, _LOOK_AHEAD + 1)
-    cell = (on.cell[usable][:, None] + reach).ravel()
-    road = np.repeat(spines.cell_spine[on.cell[usable]], len(reach))
-    inside = (cell >= 0) & (cell < spines.n_cells)
-    inside[inside] &= spines.cell_spine[cell[inside]] == road[inside]
-    cell, at = cell[inside], np.repeat(height[usable], len(reach))[inside]
-    order = np.lexsort((at, cell))
-    cell, at = cell[order], at[order]
-    new = (np.diff(cell, prepend=-1) != 0) | (np.diff(at, prepend=-_FAR) > options.altitude_gate)
-    group = np.cumsum(new) - 1
-    middle = np.bincount(group, weights=at) / np.bincount(group) if len(group) else np.zeros(0)
-    cells = cell[new]
+    cell, at, information = _heights_of_passes(frames, on, height, spines)
+    bins = np.round(at / _BIN).astype(np.int64)
+    order = np.lexsort((bins, cell))
+    cell, bins, at, information = cell[order], bins[order], at[order], information[order]
+    group = np.cumsum((np.diff(cell, prepend=-1) != 0) | (np.diff(bins, prepend=0) != 0)) - 1
+    weight = np.bincount(group, information).astype(np.float64)  # integers where there is nothing to count
+    middle = np.bincount(group, information * at) / weight
+    cells = cell[np.flatnonzero(np.diff(group, prepend=-1))]
+    starts = np.append(np.flatnonzero(np.diff(cells, prepend=-1)), len(cells))
+    floor = _joined(starts, middle, weight, options.altitude_gate)
+    middle = np.bincount(floor, weight * middle) / np.bincount(floor, weight)
+    cells = cells[np.flatnonzero(np.diff(floor, prepend=-1))]
     floors = Floors(cells, middle, Places(np.full(len(cells), -1), np.full(len(cells), -1)))
     linked = {}
     for name, step in (("before", -1), ("after", 1)):
@@ -78,6 +88,64 @@ def find_floors(on: OnSpines, height: NDArray[np.float64], spines: Spines, optio
         found = floor_of(floors, neighbour, middle, options)
         linked[name] = np.where(same & (neighbour != cells), found, -1)
     return Floors(cells, middle, Places(**linked))
+
+
+def _heights_of_passes(
+    frames: Keyframes, on: OnSpines, height: NDArray[np.float64], spines: Spines
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Mean height of each pass at each cell that it drives through or looks at: cells, heights, and what GNSS knows.
+
+    A pass is a drive from where it comes onto a spine to where it leaves it. The last is the inverse of the variance
+    of its height on its own, 1/m2.
+    """
+    spine = np.where(on.cell >= 0, spines.cell_spine[np.maximum(on.cell, 0)], -1)
+    passes = np.cumsum((np.diff(spine, prepend=-2) != 0) | frames.first)
+    usable = np.flatnonzero((on.cell >= 0) & np.isfinite(height))
+    reach = np.arange(-1, _LOOK_AHEAD + 1)
+    cell = (on.cell[usable][:, None] + reach).ravel()
+    frame = np.repeat(usable, len(reach))
+    inside = (cell >= 0) & (cell < spines.n_cells)
+    inside[inside] &= spines.cell_spine[cell[inside]] == spine[frame[inside]]
+    cell, frame = cell[inside], frame[inside]
+    span = int(passes.max(initial=0)) + 1
+    key, index = np.unique(cell * span + passes[frame], return_inverse=True)
+    n = np.bincount(index)
+    sigma = VERTICAL * np.bincount(index, frames.sigma[frame]) / n
+    return key // span, np.bincount(index, height[frame]) / n, sigma**-2.0
+
+
+@njit(cache=True)
+def _joined(
+    starts: NDArray[np.int64], middle: NDArray[np.float64], weight: NDArray[np.float64], gate: float
+) -> NDArray[np.int64]:
+    """Join neighbouring groups within each stretch, nearest first: the floor of each group, ascending."""
+    floor = np.empty(len(middle), np.int64)
+    found = 0
+    for stretch in range(len(starts) - 1):
+        begin, end = int(starts[stretch]), int(starts[stretch + 1])
+        at, mass = middle[begin:end].copy(), weight[begin:end].copy()
+        last = np.arange(end - begin)  # group with which each floor ends
+        n = end - begin
+        while n > 1:
+            distance = at[1:n] - at[: n - 1]
+            limit = np.maximum(gate, _DOUBT * np.sqrt(1.0 / mass[1:n] + 1.0 / mass[: n - 1]))
+            nearest = int(np.argmin(distance / limit))
+            if distance[nearest] > limit[nearest]:
+                break
+            total = mass[nearest] + mass[nearest + 1]
+            at[nearest] = (mass[nearest] * at[nearest] + mass[nearest + 1] * at[nearest + 1]) / total
+            mass[nearest], last[nearest] = total, last[nearest + 1]
+            for values in (at, mass):
+                values[nearest + 1 : n - 1] = values[nearest + 2 : n].copy()
+            last[nearest + 1 : n - 1] = last[nearest + 2 : n].copy()
+            n -= 1
+        first = begin
+        for k in range(n):
+            beyond = begin + int(last[k]) + 1
+            floor[first:beyond] = found
+            first = beyond
+            found += 1
+    return floor
 
 
 def floor_of(

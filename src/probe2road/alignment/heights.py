@@ -19,7 +19,8 @@ from probe2road.alignment.options import AlignOptions
 __all__ = ["VERTICAL", "solve_heights"]
 
 VERTICAL = 1.6  # vertical over horizontal error of GNSS under open sky
-_FLOOR_SIGMA = 0.2  # m, of a keyframe about its floor
+_FLOOR_SIGMA = 0.1  # m, of a drive about its floor
+_FLOOR_KERNEL = 1.0  # sigmas beyond which a floor counts less
 _CHANGE_SIGMA = 0.05  # m, of the change of height between keyframes, however short
 _KERNEL = 2.0  # sigmas of one fix beyond which GNSS counts less (Cauchy)
 _ROUNDS = 3
@@ -32,6 +33,7 @@ def solve_heights(
     options: AlignOptions,
     *,
     held: NDArray[np.bool_],
+    start: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Return the heights that drives on the same floor agree on.
 
@@ -47,6 +49,8 @@ def solve_heights(
         The sigmas.
     held
         Keyframes whose height does not change, shape ``(k,)``.
+    start
+        Heights that are nearly right, m, shape ``(k,)``: what contradicts them counts less from the first round on.
 
     Returns
     -------
@@ -74,14 +78,15 @@ def solve_heights(
     gnss = VERTICAL * frames.sigma[known] * inflation
     gnss[held[known]] = 0.01
     motion = np.hypot(_CHANGE_SIGMA, options.height_share * step)
-    sigmas = [motion, np.full(len(on), _FLOOR_SIGMA), gnss]
-    solution = np.concatenate([frames.z[known], np.zeros(len(floors))])
-    kernels = (3.0, 3.0, _KERNEL / inflation)
+    sigmas = [motion, _FLOOR_SIGMA * frames.inflation(options)[on], gnss]
+    guess = frames.z if start is None else start
+    solution = np.concatenate([guess[known], np.bincount(floor_index, (guess - ground)[on]) / np.bincount(floor_index)])
+    kernels = (3.0, _FLOOR_KERNEL, _KERNEL / inflation)
     for turn in range(_ROUNDS):
         normal, right = csr_matrix((n, n)), np.zeros(n)
         for matrix, target, sigma, kernel in zip(rows, wanted, sigmas, kernels, strict=True):
             off = (matrix @ solution - target) / sigma / kernel
-            weight = sigma**-2.0 / (1.0 + (off**2 if turn else 0.0))
+            weight = sigma**-2.0 / (1.0 + (off**2 if turn or start is not None else 0.0))
             normal = normal + matrix.T @ diags(weight) @ matrix
             right += matrix.T @ (weight * target)
         solution = spsolve((normal + diags(np.full(n, 1e-9))).tocsc(), right)

@@ -19,7 +19,7 @@ class AlignOptions:
     margin: float = 300.0  # m, by which tiles reach into each other; there the results are blended
     keyframe_spacing: float = 20.0  # m driven between the poses of the factor graph
     heading_gate: float = 25.0  # degrees; roads that differ by more never attract each other
-    altitude_gate: float = 3.0  # m; nor do roads that lie further apart in height
+    altitude_gate: float = 2.5  # m; nor do roads further apart in height: half of what decks are (METHOD has 3 m)
     reach: float = 12.0  # m, lateral; drives nearer than this may be on one carriageway
     search: float = 9.0  # m, lateral shift within which a drive is looked for on the others
     first_gate: float = 1.5  # m, from a point to its line, in the first round; registration has been before

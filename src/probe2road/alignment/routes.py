@@ -48,7 +48,7 @@ def route_heights(
     Returns
     -------
     ndarray, shape (k,)
-        Metres above the spine; NaN where the height or the spine is not known, 0 where no drive has heights.
+        Metres, as recorded heights are; NaN where the height or the spine is not known, 0 where no drive has heights.
     """
     if not np.isfinite(frames.z).any():
         return np.zeros(len(frames.z))
@@ -57,7 +57,7 @@ def route_heights(
     height = solve_heights(frames, _places(on, route), ground, options, held=held)
     route = split_decks(route, frames.drive, frames.z - height, VERTICAL * frames.sigma, options.altitude_gate)
     height = solve_heights(frames, _places(on, route), ground, options, held=held)
-    return np.where(on.station >= 0, height - ground, np.nan)
+    return np.where(on.station >= 0, height, np.nan)
 
 
 def _places(on: OnSpines, route: NDArray[np.int64]) -> NDArray[np.int64]:

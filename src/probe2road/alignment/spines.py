@@ -46,6 +46,13 @@ class Spines:
         """Number of cells."""
         return len(self.cell_spine)
 
+    def above(self, station: NDArray[np.int64], level: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far above their stations heights are, m, shape ``(n,)``; it means nothing where there is no station.
+
+        Each spine lies as high as one drive said, so this changes by metres from one spine to the next.
+        """
+        return level - self.z[np.maximum(station, 0)]
+
 
 @dataclass(frozen=True)
 class OnSpines:
