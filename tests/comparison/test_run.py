@@ -1,5 +1,6 @@
 import csv
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,16 @@ def test_other_options_are_built_anew(sets, tmp_path):
     second = score_cells(source, other)[0]
     assert second.figures["km"] < first.figures["km"]
     assert not second.figures["resumed"]
+
+
+def test_a_fleet_that_is_aligned_anew_is_built_anew(sets, tmp_path):
+    shutil.copytree(sets / NAME, tmp_path / NAME)
+    source, method = Source(tmp_path / NAME, tmp_path / "work"), METHODS["kde"]
+    graphs = []
+    for poses in ("modelled", "raw", "raw"):
+        shutil.copy(replace(source, poses=poses).fleet_file, source.fleet_file)
+        graphs.append((build_cell(source, method) / "graph.gpkg").stat().st_mtime_ns)
+    assert graphs[0] < graphs[1] == graphs[2]
 
 
 def test_fewer_drives_are_chosen_from_the_whole_fleet(sets, tmp_path):

@@ -82,12 +82,13 @@ def build_cell(source: Source, method: Method, *, like: Method | None = None) ->
         Method that differs behind the segmentation alone. It is built first, and its probability is taken.
     """
     folder = source.place / method.name
+    _ = source.digest  # says what is missing
+    make_fleet(source)
     key = _key(source, method)
     if (kept := _read(folder / _RECORD)) is not None and kept["key"] == key:
         return folder
     if kept is not None:
         shutil.rmtree(folder)
-    make_fleet(source)
     folder.mkdir(parents=True, exist_ok=True)
     if like is not None:
         copy_first_stage(build_cell(source, like) / STAGES, folder / STAGES)
@@ -170,6 +171,7 @@ def _key(source: Source, method: Method) -> dict[str, Any]:
         "points": method.points,
         "dataset": source.name,
         "digest": source.digest,
+        "aligned": source.aligned_digest,
         "seed": find_dataset(source.name).seed,
         "poses": source.poses,
         "drives": source.drives,

@@ -65,6 +65,14 @@ class Source:
         check_dataset(self.folder)
         return hashlib.sha256((self.folder / "manifest.json").read_bytes()).hexdigest()[:16]
 
+    @property
+    def aligned_digest(self) -> str | None:
+        """Of the aligned fleet, which is no part of the data set as it was prepared; None for other poses."""
+        if self.poses != "aligned":
+            return None
+        with Recording(self.folder).aligned.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
     @cached_property
     def driven(self) -> RoadGraph:
         """The true road graph with the true number of drives."""
