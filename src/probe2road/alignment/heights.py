@@ -2,8 +2,9 @@
 
 Strategy: roll and pitch are not in the data, so a point says nothing about the height of its keyframe that the drive
 does not say itself. Each keyframe has one unknown, each floor another (the road's height there above the spine).
-Motion ties keyframes of a drive, floors tie drives, GNSS pulls weakly. The sparse normal equations are solved three
-times, with weights that let bursts go.
+Motion ties keyframes of a drive, floors tie drives, GNSS pulls weakly. A drive's error about its floors, like that of
+GNSS, counts once in each kilometre, so that one wrong floor does not bend all of a drive. The sparse normal equations
+are solved three times, with weights that let bursts and wrong floors go.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from probe2road.alignment.options import AlignOptions
 __all__ = ["VERTICAL", "solve_heights"]
 
 VERTICAL = 1.6  # vertical over horizontal error of GNSS under open sky
-_FLOOR_SIGMA = 0.1  # m, of a drive about its floor
+_FLOOR_SIGMA = 0.1  # m, of a drive about its floors
 _FLOOR_KERNEL = 1.0  # sigmas beyond which a floor counts less
 _CHANGE_SIGMA = 0.05  # m, of the change of height between keyframes, however short
 _KERNEL = 2.0  # sigmas of one fix beyond which GNSS counts less (Cauchy)
@@ -74,14 +75,14 @@ def solve_heights(
         csr_matrix((np.ones(len(known)), (np.arange(len(known)), column[known])), (len(known), n)),
     ]
     wanted = [frames.z[pair] - frames.z[pair - 1], ground[on], frames.z[known]]
-    inflation = frames.inflation(options)[known]
-    gnss = VERTICAL * frames.sigma[known] * inflation
+    inflation = frames.inflation(options)
+    gnss = VERTICAL * frames.sigma[known] * inflation[known]
     gnss[held[known]] = 0.01
     motion = np.hypot(_CHANGE_SIGMA, options.height_share * step)
-    sigmas = [motion, _FLOOR_SIGMA * frames.inflation(options)[on], gnss]
+    sigmas = [motion, _FLOOR_SIGMA * inflation[on], gnss]
     guess = frames.z if start is None else start
     solution = np.concatenate([guess[known], np.bincount(floor_index, (guess - ground)[on]) / np.bincount(floor_index)])
-    kernels = (3.0, _FLOOR_KERNEL, _KERNEL / inflation)
+    kernels = (3.0, _FLOOR_KERNEL, _KERNEL / inflation[known])
     for turn in range(_ROUNDS):
         normal, right = csr_matrix((n, n)), np.zeros(n)
         for matrix, target, sigma, kernel in zip(rows, wanted, sigmas, kernels, strict=True):
