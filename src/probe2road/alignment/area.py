@@ -165,12 +165,15 @@ def _points_on_spines(scene: _Scene, pose: NDArray[np.float64], spines: Spines) 
 def _points_on_floors(
     scene: _Scene, pose: NDArray[np.float64], spines: Spines, floors: Floors, level: NDArray[np.float64]
 ) -> tuple[OnSpines, NDArray[np.int64]]:
-    """Project all points, and find the floor of each: as high above the spine as its keyframe, if that is on it."""
+    """Project all points, and find their floors: that of their keyframes, -1 for points beside another spine.
+
+    What a keyframe sees of another spine says where it is across that one, not across its own.
+    """
     frame = scene.seen.keyframe
     on, points = project(spines, pose, scene.options), _points_on_spines(scene, pose, spines)
     alike = spines.cell_spine[points.cell] == spines.cell_spine[on.cell[frame]]
-    above = np.where(alike, spines.above(on.station, level)[frame], spines.above(points.station, level[frame]))
-    return points, floor_of(floors, points.cell, above, scene.options)
+    floor = floor_of(floors, points.cell, spines.above(on.station, level)[frame], scene.options)
+    return points, np.where(alike, floor, -1)
 
 
 def _register(
