@@ -14,6 +14,7 @@ from probe2road.comparison.measured import Measured
 from probe2road.comparison.source import Source
 from probe2road.errors import InputError, OptionError
 from probe2road.recipe import Segmentation
+from probe2road.segmentation.weights import read_weights
 
 NAME = "interchange-diamond-1"
 LOSS = {"geo_f1": 0.9, "itopo_f1": 0.7, "soft_f1": 0.8, "steps": 600}
@@ -75,7 +76,8 @@ def test_the_command_writes_a_page_cells_and_figures(sets, work, tmp_path, monke
 def test_a_variant_takes_the_probability_and_scores_like_the_base_with_its_options(source, monkeypatch):
     base = score_cells(source, BASE)[-1]
     monkeypatch.setattr("probe2road.recipe.predict_window", None)
-    same = replace(vary("threshold-0.2", {"network": {"threshold": 0.3, "seed_threshold": 0.3}}), name="ablations/same")
+    own = read_weights(BASE.weights).info.threshold
+    same = replace(vary("threshold-0.2", {"network": {"threshold": own, "seed_threshold": own}}), name="ablations/same")
     build_cell(source, same, like=BASE)
     (cell,) = score_cells(source, same)
     assert cell.key["options"] != base.key["options"]
