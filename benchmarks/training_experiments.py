@@ -137,11 +137,10 @@ def run(variation: Variation, sets: Path, steps: int, weights: Path, *, seed: in
     (validated,) = config.validation.sources
     validation = replace(config.validation, sources=(replace(validated, data=variation.validated),))
     config = replace(config, validation=validation)
-    # Interchanges stay modelled: there are twenty, and to align them takes as long as a city.
-    learned = [one.data == "modelled" and one.name != "interchanges" for one in config.sources]
+    # Interchanges are always modelled: there are twenty, and to align them takes as long as a city.
     sources = [
-        replace(one, data=variation.data) if chosen else one
-        for one, chosen in zip(config.sources, learned, strict=True)
+        one if one.data == "raw" else replace(one, data="modelled" if one.name == "interchanges" else variation.data)
+        for one in config.sources
     ]
     scenes = [(open_scene(source, sets), source.weight) for source in members(sources)]
     torch.manual_seed(config.seed)

@@ -163,15 +163,20 @@ def _points_on_spines(scene: _Scene, pose: NDArray[np.float64], spines: Spines) 
 
 
 def _points_on_floors(
-    scene: _Scene, pose: NDArray[np.float64], spines: Spines, floors: Floors, level: NDArray[np.float64]
+    scene: _Scene,
+    pose: NDArray[np.float64],
+    on: OnSpines,
+    spines: Spines,
+    floors: Floors,
+    level: NDArray[np.float64],
 ) -> tuple[OnSpines, NDArray[np.int64]]:
     """Project all points, and find their floors: that of their keyframes, -1 for points beside another spine.
 
     What a keyframe sees of another spine says where it is across that one, not across its own.
     """
     frame = scene.seen.keyframe
-    on, points = project(spines, pose, scene.options), _points_on_spines(scene, pose, spines)
-    alike = spines.cell_spine[points.cell] == spines.cell_spine[on.cell[frame]]
+    points = _points_on_spines(scene, pose, spines)
+    alike = spines.spine_of(points.cell) == spines.spine_of(on.cell)[frame]
     floor = floor_of(floors, points.cell, spines.above(on.station, level)[frame], scene.options)
     return points, np.where(alike, floor, -1)
 
@@ -193,7 +198,7 @@ def _register(
         pose = anchored(frames, pose, angle, home, floors.places, options, held=scene.held)
         on = project(spines, pose, options)
         home = floor_of(floors, on.cell, spines.above(on.station, level), options)
-    points, floor = _points_on_floors(scene, pose, spines, floors, level)
+    points, floor = _points_on_floors(scene, pose, on, spines, floors, level)
     found = floor >= 0
     seen = Evidence(scene.seen.keyframe[found], floor[found], points.left[found], scene.seen.kind[found])
     angle = spines.station[np.maximum(on.station, 0), 2]
@@ -221,7 +226,8 @@ def _round(
 ) -> tuple[NDArray[np.float64], Matches]:
     """Match points to lines and optimise: new poses, and the matches that led to them."""
     options, frame = scene.options, scene.seen.keyframe
-    points, floor = _points_on_floors(scene, pose, spines, floors, level)
+    on = project(spines, pose, options)
+    points, floor = _points_on_floors(scene, pose, on, spines, floors, level)
     matches = match_lines(
         floor, points.along, points.left, scene.seen.kind, scene.frames.drive[frame], options, gate=gate
     )
@@ -232,7 +238,7 @@ def _round(
         matches, frame[at], patch[floor[at]], scene.seen.body[at],
         spines.station[points.station[at], 2] - pose[frame[at], 2], sigma, gate=gate,
     )  # fmt: skip
-    paths = _paths(scene, pose, spines, floors, level, np.unique(sights.keyframe))
+    paths = _paths(scene, pose, on, spines, floors, level, np.unique(sights.keyframe))
     both = Condensed(*(np.concatenate(pair) for pair in zip(_fields(sights), _fields(paths), strict=True)))
     held_patches = np.zeros(len(patch), bool)
     held_patches[patch[floor[at]][scene.held[frame[at]]]] = True
@@ -251,6 +257,7 @@ def _fields(condensed: Condensed) -> tuple[NDArray[np.generic], ...]:
 def _paths(
     scene: _Scene,
     pose: NDArray[np.float64],
+    on: OnSpines,
     spines: Spines,
     floors: Floors,
     level: NDArray[np.float64],
@@ -258,7 +265,6 @@ def _paths(
 ) -> Condensed:
     """Attract drives whose camera saw nothing to the middle of all paths: weakly, because lanes differ."""
     options = scene.options
-    on = project(spines, pose, options)
     floor = floor_of(floors, on.cell, spines.above(on.station, level), options)
     blind = floor >= 0
     chain = scene.frames.chain

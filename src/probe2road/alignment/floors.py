@@ -98,7 +98,7 @@ def _heights_of_passes(
     A pass is a drive from where it comes onto a spine to where it leaves it. The last is the inverse of the variance
     of its height on its own, 1/m2.
     """
-    spine = np.where(on.cell >= 0, spines.cell_spine[np.maximum(on.cell, 0)], -1)
+    spine = spines.spine_of(on.cell)
     passes = np.cumsum((np.diff(spine, prepend=-2) != 0) | frames.first)
     usable = np.flatnonzero((on.cell >= 0) & np.isfinite(height))
     reach = np.arange(-1, _LOOK_AHEAD + 1)

@@ -83,7 +83,7 @@ def routes(frames: Keyframes, on: OnSpines, spines: Spines) -> NDArray[np.int64]
     ndarray of int64, shape (k,)
         0 or more; -1 where a keyframe is on no spine.
     """
-    spine = np.where(on.cell >= 0, spines.cell_spine[np.maximum(on.cell, 0)], -1)
+    spine = spines.spine_of(on.cell)
     spine = _without_flickers(spine, frames.chain)
     new = (np.diff(spine, prepend=-2) != 0) | frames.first
     run = np.cumsum(new) - 1

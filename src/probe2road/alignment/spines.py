@@ -46,6 +46,10 @@ class Spines:
         """Number of cells."""
         return len(self.cell_spine)
 
+    def spine_of(self, cell: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Spine of each cell, -1 for a cell of -1: shape ``(n,)``."""
+        return np.where(cell >= 0, self.cell_spine[np.maximum(cell, 0)], -1)
+
     def above(self, station: NDArray[np.int64], level: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far above their stations heights are, m, shape ``(n,)``; it means nothing where there is no station.
 
