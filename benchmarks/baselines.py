@@ -22,10 +22,10 @@ from probe2road.baselines.deepmg.recipe import DeepMGOptions, build_deepmg
 from probe2road.baselines.kde import build_kde
 from probe2road.comparison.measured import measure
 from probe2road.fleet import Fleet
+from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.metrics.evaluate import MetricOptions
 from probe2road.picture import draw_graph
 from probe2road.recipe import BuildOptions
-from probe2road.roadgraph import RoadGraph, graph_from_lines
 
 PUBLISHED = "Biagioni 2012"
 METRICS: list[str | MetricOptions] = ["geo", "itopo", "topo", "apls"]

@@ -18,8 +18,8 @@ from bench_metrics import street_lines
 from numpy.typing import NDArray
 
 from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.mapmatch import MatchOptions, match
-from probe2road.roadgraph import RoadGraph, graph_from_lines
 
 SPEED = 12.0  # m/s
 DURATION = 1800  # s

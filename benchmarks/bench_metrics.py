@@ -12,8 +12,8 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
+from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.metrics import METRICS, GeoOptions, ItopoOptions, comparable, evaluate, geo
-from probe2road.roadgraph import RoadGraph, graph_from_lines
 
 BLOCK = 100.0  # m between corners
 VERTEX = 10.0  # m between vertices, as on a vectorised skeleton

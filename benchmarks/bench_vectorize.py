@@ -17,7 +17,7 @@ from pyproj import CRS
 from rasterio.features import rasterize
 from scipy.ndimage import binary_dilation
 
-from probe2road.clean import clean_graph
+from probe2road.graph.clean import clean_graph
 from probe2road.raster import Grid
 from probe2road.skeleton import Method, skeleton_pixels, skeletonize, skeletonize_windows
 from probe2road.tracing import trace_pixels

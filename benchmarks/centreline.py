@@ -21,13 +21,13 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road import build, evaluate, read_fleet, read_graph
-from probe2road.centreline import CentrelineOptions, refine_centreline
 from probe2road.edge_frame import edge_lines, stations_along
 from probe2road.fleet import Fleet
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.mapmatch import match
 from probe2road.recipe import BuildOptions
-from probe2road.refinement import RefineOptions
-from probe2road.roadgraph import RoadGraph
+from probe2road.refinement.centreline import CentrelineOptions, refine_centreline
+from probe2road.refinement.recipe import RefineOptions
 from probe2road.simulate.fleet_simulation import simulate
 from probe2road.simulate.generate import generate_interchange, generate_town
 from probe2road.simulate.network import RoadNetwork

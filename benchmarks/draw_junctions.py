@@ -15,13 +15,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 import shapely
 
-from probe2road.clean import clean_graph
-from probe2road.disambiguate import split_false_junctions
-from probe2road.gaps import fill_gaps, gap_weights, prune_gaps
+from probe2road.graph.clean import clean_graph
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.mapmatch import match
-from probe2road.passages import passing_positions
 from probe2road.recipe import BuildOptions, build
-from probe2road.roadgraph import RoadGraph
+from probe2road.refinement.gaps.fill import fill_gaps, gap_weights, prune_gaps
+from probe2road.refinement.junctions.passages import passing_positions
+from probe2road.refinement.junctions.split import split_false_junctions
 from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
 from probe2road.simulate.generate import generate_interchange
 from probe2road.simulate.presets import find_preset

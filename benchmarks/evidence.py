@@ -18,9 +18,9 @@ import pandas as pd
 import shapely
 
 from probe2road.edge_frame import edge_lines, stations_along
-from probe2road.evidence import add_evidence
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.mapmatch import match
-from probe2road.roadgraph import RoadGraph
+from probe2road.refinement.evidence import add_evidence
 from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
 from probe2road.simulate.generate import generate_interchange, generate_town
 from probe2road.simulate.network import RoadNetwork

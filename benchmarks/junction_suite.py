@@ -19,15 +19,18 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from probe2road.clean import clean_graph
-from probe2road.disambiguate import DisambiguateOptions, split_false_junctions
 from probe2road.fleet import Fleet
 from probe2road.fleet_tables import empty_points
-from probe2road.gaps import fill_gaps, gap_weights, prune_gaps
+from probe2road.graph.clean import clean_graph
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.splitting import split_edges
+from probe2road.graph.tables import finish_edges
+from probe2road.graph.topology import end_nodes
 from probe2road.mapmatch import Matches, match
-from probe2road.passages import passing_positions
 from probe2road.recipe import BuildOptions, build
-from probe2road.roadgraph import RoadGraph, finish_edges
+from probe2road.refinement.gaps.fill import fill_gaps, gap_weights, prune_gaps
+from probe2road.refinement.junctions.passages import passing_positions
+from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
 from probe2road.simulate.crossings import find_crossings
 from probe2road.simulate.fleet_simulation import FleetWorld, fleet_world, simulate_drive
 from probe2road.simulate.generate import generate_interchange, generate_town
@@ -35,8 +38,6 @@ from probe2road.simulate.network import RoadNetwork
 from probe2road.simulate.presets import find_preset
 from probe2road.simulate.records import DriveLabels, drive_tables
 from probe2road.simulate.routes import LinkGraph, draw_route
-from probe2road.splitting import split_edges
-from probe2road.topology import end_nodes
 
 KINDS: Mapping[str, Mapping[str, float | str]] = {
     "diamond": {"kind": "diamond"},

@@ -39,8 +39,9 @@ from numpy.typing import NDArray
 
 from probe2road.crs import WGS84, local_crs, transform
 from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.mapmatch import Matches, MatchOptions, match
-from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
 
 DATA = Path(os.environ.get("PROBE2ROAD_DATA", "../shared/data")) / "mapmatching" / "kubicka"
 INTERVALS = (1, 5, 15, 30, 60)  # s

@@ -16,25 +16,25 @@ from pathlib import Path
 
 from probe2road.benchmark.recording import POSES, Recording
 from probe2road.benchmark.reference import labelled_reference
-from probe2road.braids import open_braids
-from probe2road.centreline import refine_centreline
-from probe2road.clean import clean_graph
 from probe2road.crs import WGS84, transform
-from probe2road.disambiguate import DisambiguateOptions, split_false_junctions
-from probe2road.evidence import add_evidence
 from probe2road.export import read_graph
 from probe2road.fleet import Fleet
-from probe2road.forks import move_forks
-from probe2road.gaps import fill_gaps, fill_jumps, gap_weights, prune_gaps
+from probe2road.graph.clean import clean_graph
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path
 from probe2road.mapmatch import match
 from probe2road.metrics import evaluate
-from probe2road.passages import passing_positions
 from probe2road.picture import draw_graph
 from probe2road.recipe import BuildOptions, build
-from probe2road.roadgraph import RoadGraph
-from probe2road.undriven import RungOptions, drop_undriven
+from probe2road.refinement.centreline import refine_centreline
+from probe2road.refinement.evidence import add_evidence
+from probe2road.refinement.gaps.fill import fill_gaps, fill_jumps, gap_weights, prune_gaps
+from probe2road.refinement.junctions.braids import open_braids
+from probe2road.refinement.junctions.forks import move_forks
+from probe2road.refinement.junctions.passages import passing_positions
+from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
+from probe2road.refinement.undriven import RungOptions, drop_undriven
 
 CITIES = ("boston", "hannover", "tokyo_shibuya")
 # Latitude and longitude of the densest interchanges.

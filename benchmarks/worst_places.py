@@ -27,7 +27,7 @@ from PIL import Image
 
 from probe2road import read_graph
 from probe2road.benchmark.reference import labelled_reference
-from probe2road.roadgraph import RoadGraph
+from probe2road.graph.roadgraph import RoadGraph
 
 SPACING, RADIUS = 5.0, 6.0  # m, of points on roads
 NODE_RADIUS = 15.0  # m

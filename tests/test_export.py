@@ -12,8 +12,8 @@ import shapely
 
 from probe2road.errors import CRSError, InputError, OptionError, OutputError
 from probe2road.export import WRITABLE, read_graph, write_graph
+from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.io.graph_networkx import from_networkx, to_networkx
-from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
 
 UTM = "EPSG:32616"
 EAST, NORTH = 446000.0, 4636000.0

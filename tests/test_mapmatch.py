@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from probe2road.crs import WGS84, local_crs, transform
 from probe2road.errors import CRSError, InputError, OptionError
 from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.mapmatch import Matches, MatchOptions, match, turn_counts
 from probe2road.matching.models import PublishedModel, RouteModel
 from probe2road.matching.network import build_states
 from probe2road.matching.published import emission_table, transition
 from probe2road.options import options_from_table
-from probe2road.roadgraph import RoadGraph, empty_graph, empty_turns, finish_edges, graph_from_lines
 
 CRS = "EPSG:32616"
 

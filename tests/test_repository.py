@@ -23,8 +23,6 @@ MODULES = {
     for path in sorted(SOURCE.rglob("*.py"))
     if path != SOURCE / "__init__.py"
 }
-# Imports inside a function that point downwards, each explained in decision 0001.
-DOWNWARD = {("roadgraph", "io.graph_networkx")}
 
 
 def layers() -> list[str]:
@@ -65,15 +63,11 @@ def test_every_module_has_a_layer_and_every_layer_a_module() -> None:
 @pytest.mark.parametrize("module", MODULES)
 def test_module_imports_only_what_stands_above_it(module: str) -> None:
     order = layers()
-    below = [name for name in imports(module) if rank(name, order) > rank(module, order)]
-    assert [name for name in below if (module, name) not in DOWNWARD] == []
+    assert [name for name in imports(module) if rank(name, order) > rank(module, order)] == []
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
-    graph = {
-        module: {name for name in imports(module) if (module, name) not in DOWNWARD and name != module}
-        for module in MODULES
-    }
+    graph = {module: {name for name in imports(module) if name != module} for module in MODULES}
     assert len(list(TopologicalSorter(graph).static_order())) == len(MODULES)
 
 

@@ -10,8 +10,9 @@ from pyproj import CRS
 from rasterio.features import rasterize
 
 from probe2road.errors import InputError, OptionError
+from probe2road.graph.check import check_graph
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster import Grid
-from probe2road.roadgraph import RoadGraph, check_graph
 from probe2road.skeleton import skeleton_pixels, skeletonize
 from probe2road.tracing import trace_pixels
 from probe2road.vectorize import VectorizeOptions, vectorize

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from probe2road.errors import Probe2RoadError
     from probe2road.export import read_graph, write_graph
     from probe2road.fleet import Fleet, TraceGaps, fleet_from_tables
+    from probe2road.graph.check import check_graph
+    from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
     from probe2road.io.fleet_reader import read_fleet
     from probe2road.io.fleet_summary import describe_fleet
     from probe2road.io.fleet_writer import write_fleet
@@ -23,8 +25,7 @@ if TYPE_CHECKING:
     from probe2road.metrics.evaluate import evaluate
     from probe2road.raster import rasterize
     from probe2road.recipe import BuildOptions, build
-    from probe2road.refinement import refine_graph
-    from probe2road.roadgraph import RoadGraph, check_graph, graph_from_lines
+    from probe2road.refinement.recipe import refine_graph
     from probe2road.view import write_view
 
 _HOME = {
@@ -35,9 +36,9 @@ _HOME = {
     "read_fleet": "io.fleet_reader",
     "write_fleet": "io.fleet_writer",
     "describe_fleet": "io.fleet_summary",
-    "RoadGraph": "roadgraph",
-    "check_graph": "roadgraph",
-    "graph_from_lines": "roadgraph",
+    "RoadGraph": "graph.roadgraph",
+    "check_graph": "graph.check",
+    "graph_from_lines": "graph.roadgraph",
     "read_graph": "export",
     "write_graph": "export",
     "to_networkx": "io.graph_networkx",
@@ -46,7 +47,7 @@ _HOME = {
     "MatchOptions": "mapmatch",
     "Matches": "mapmatch",
     "match": "mapmatch",
-    "refine_graph": "refinement",
+    "refine_graph": "refinement.recipe",
     "label_reference": "labels",
     "BuildOptions": "recipe",
     "build": "recipe",

@@ -18,6 +18,7 @@ from probe2road.errors import CRSError
 
 __all__ = [
     "WGS84",
+    "crs_to_text",
     "is_true_to_scale",
     "local_crs",
     "parse_crs",
@@ -241,3 +242,17 @@ def _named_crs(proj: str, name: str) -> CRS:
     definition = CRS.from_user_input(f"{proj} +datum=WGS84 +units=m +no_defs +type=crs").to_json_dict()
     definition["name"] = name
     return CRS.from_json_dict(definition)
+
+
+def crs_to_text(crs: CRS) -> str:
+    """Return the shortest text that `probe2road.crs.parse_crs` turns into an equal CRS.
+
+    Examples
+    --------
+    >>> crs_to_text(CRS.from_epsg(32616))
+    'EPSG:32616'
+    """
+    authority = crs.to_authority()
+    if authority is not None and CRS.from_authority(*authority) == crs:
+        return ":".join(authority)
+    return crs.to_json()

@@ -7,8 +7,8 @@ from typing import Any
 
 from probe2road.crs import WGS84
 from probe2road.export import READABLE, read_graph
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_summary import describe_fleet
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["describe_file", "describe_graph"]
 
@@ -52,7 +52,7 @@ def describe_graph(graph: RoadGraph) -> dict[str, Any]:
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> figures = describe_graph(graph_from_lines([[(446000, 4636000), (446100, 4636000)]], crs="EPSG:32616"))
     >>> figures["dead_ends"], figures["length_km"], figures["bbox"]
     (2, 0.1, [-87.650..., 41.874..., -87.649..., 41.874...])

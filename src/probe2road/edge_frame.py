@@ -23,8 +23,8 @@ from scipy.linalg import solveh_banded
 
 from probe2road.errors import InputError
 from probe2road.fleet import Fleet
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.mapmatch import Matches
-from probe2road.roadgraph import RoadGraph
 
 __all__ = [
     "EdgeLines",
@@ -124,7 +124,7 @@ def edge_lines(graph: RoadGraph) -> EdgeLines:
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> lines = edge_lines(graph_from_lines([[(0, 0), (9, 0)], [(9, 0), (9, 8)]], crs="EPSG:32616"))
     >>> place, direction = lines.at(np.array([0, 1, 1]), np.array([3.0, 0.0, 99.0]))
     >>> place[:, :2].tolist(), direction.tolist()
@@ -169,7 +169,7 @@ def courses(
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> lines = edge_lines(graph_from_lines([[(0, 0), (14, 0), (20, 0)]], crs="EPSG:32616"))
     >>> courses(lines, stations_along(lines.length, 10.0), np.array([True, True, True]))[1].tolist()
     [0.0, 10.0, 14.0, 20.0]
@@ -212,7 +212,7 @@ def frame(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[Traversals,
     --------
     >>> from probe2road.fleet import fleet_from_tables
     >>> from probe2road.mapmatch import match
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(3), "x": [40.0, 90, 140], "y": [2.0, 1, -1]})
     >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")

@@ -11,14 +11,12 @@ from typing import Any
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError
 
 from probe2road.errors import InputError, OptionError, OutputError
+from probe2road.graph.check import check_graph
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.graph_networkx import read_graphml, write_graphml
 from probe2road.io.graph_readers import read_parquet_graph, read_vector_graph
 from probe2road.io.graph_writers import write_flatgeobuf, write_geojson, write_geopackage, write_geoparquet
 from probe2road.io.osm import read_osm, write_osm
-from probe2road.roadgraph import (
-    RoadGraph,
-    check_graph,
-)
 
 __all__ = ["READABLE", "WRITABLE", "graph_format", "read_graph", "write_graph"]
 
@@ -50,7 +48,7 @@ def write_graph(graph: RoadGraph, path: str | PathLike[str]) -> None:
     Examples
     --------
     >>> import tempfile
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> path = Path(tempfile.mkdtemp()) / "roads.gpkg"
     >>> write_graph(graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616"), path)
     >>> read_graph(path)

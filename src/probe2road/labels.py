@@ -20,11 +20,12 @@ from probe2road.crs import same_crs
 from probe2road.edge_frame import frame
 from probe2road.errors import CRSError, OptionError
 from probe2road.fleet import Fleet
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.splitting import split_edges
+from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.grid import Grid
 from probe2road.mapmatch import MatchOptions, match
 from probe2road.osrm import OsrmOptions, osrm_network, osrm_segments, osrm_server
-from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
-from probe2road.splitting import split_edges
 
 __all__ = ["MATCHERS", "LabelOptions", "cut_reference", "draw_lines", "label_mask", "label_pieces", "label_reference"]
 
@@ -93,7 +94,7 @@ def label_reference(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions
     Examples
     --------
     >>> from probe2road.fleet import fleet_from_tables
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> reference = graph_from_lines([[(0, 0), (240, 0)], [(240, 0), (240, 90)]], crs="EPSG:32616")
     >>> there = pd.DataFrame({"t": range(15), "x": np.arange(5.0, 155, 10), "y": 1.0})
     >>> drives = pd.concat([there.assign(trace_id=k) for k in range(4)])
@@ -158,7 +159,7 @@ def cut_reference(reference: RoadGraph, *, max_piece: float = 100.0) -> RoadGrap
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (210, 0)], [(210, 0), (210, 60)]], crs="EPSG:32616")
     >>> cut_reference(graph).edges[["length", "reference_edge"]].values.tolist()
     [[70.0, 0.0], [60.0, 1.0], [70.0, 0.0], [70.0, 0.0]]
@@ -201,7 +202,7 @@ def label_mask(graph: RoadGraph, grid: Grid, *, width: int = 1) -> NDArray[np.ui
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(900.5, 0.5), (902.5, 0.5), (904.5, 2.5)]], crs="EPSG:32616")
     >>> label_mask(graph, Grid.from_bounds(graph.bounds, crs=graph.crs))
     array([[0, 0, 0, 0, 1],

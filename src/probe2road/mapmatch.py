@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from probe2road.crs import require_metric, same_crs
 from probe2road.errors import CRSError, InputError, OptionError
 from probe2road.fleet import Fleet
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import TURN_DTYPES
 from probe2road.matching.chains import Paths, match_over_routes
 from probe2road.matching.models import FLEET, SPARSE, PublishedModel, RouteModel
 from probe2road.matching.network import States, build_follow, build_states, edge_weight_array
@@ -25,7 +27,6 @@ from probe2road.matching.observe import observe, sampling_interval, seconds
 from probe2road.matching.published import match_published
 from probe2road.matching.tables import fix_table, joined_paths, step_table
 from probe2road.matching.viterbi import parameters
-from probe2road.roadgraph import TURN_DTYPES, RoadGraph
 
 __all__ = ["PROFILES", "MatchOptions", "Matches", "match", "turn_counts"]
 
@@ -116,7 +117,7 @@ def match(
     Examples
     --------
     >>> from probe2road.fleet import fleet_from_tables
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 80)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(5), "x": [20.0, 60, 90, 101, 500], "y": [1.0, 0, 2, 40, 500]})
     >>> found = match(fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616"), graph)
@@ -173,7 +174,7 @@ def turn_counts(matches: Matches, graph: RoadGraph) -> pd.DataFrame:
     Examples
     --------
     >>> from probe2road.fleet import fleet_from_tables
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(4), "x": [130.0, 110, 90, 70], "y": 0.0})
     >>> found = match(fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616"), graph)

@@ -52,7 +52,7 @@ def options_from_table(table: dict[str, Any], kind: type[T], *, where: object = 
 
     Examples
     --------
-    >>> from probe2road.clean import CleanOptions
+    >>> from probe2road.graph.clean import CleanOptions
     >>> options_from_table({"dead_end": 20}, CleanOptions).dead_end
     20.0
     >>> options_from_table({"deadend": 20}, CleanOptions, where="build.toml")

@@ -32,7 +32,8 @@ from probe2road.crs import WGS84, transform
 from probe2road.edge_frame import courses, edge_lines, stations_along
 from probe2road.errors import InputError, MissingExtraError, OptionError, Probe2RoadError
 from probe2road.fleet import Fleet
-from probe2road.roadgraph import RoadGraph, driving_direction
+from probe2road.graph.direction import driving_direction
+from probe2road.graph.roadgraph import RoadGraph
 
 __all__ = ["OsrmNetwork", "OsrmOptions", "find_osrm", "osrm_network", "osrm_segments", "osrm_server"]
 
@@ -134,7 +135,7 @@ def osrm_network(graph: RoadGraph, options: OsrmOptions | None = None) -> OsrmNe
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> network = osrm_network(graph_from_lines([[(0, 0), (50, 0)], [(50, 0), (50, 15)]], crs="EPSG:32616"))
     >>> network.edge.tolist(), network.high.round(1).tolist()
     ([0, 0, 0, 1], [16.7, 33.3, 50.0, 15.0])

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet import Fleet
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.grid import Grid
 from probe2road.io.atomic import atomic_path
 from probe2road.raster import rasterize
-from probe2road.roadgraph import RoadGraph
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,7 +103,7 @@ def write_filmstrip(
     --------
     >>> import tempfile
     >>> from pathlib import Path
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> picture = Path(tempfile.mkdtemp()) / "strip.png"
     >>> write_filmstrip([Stage("Graph", graph_from_lines([[(0, 0), (100, 50)]], crs="EPSG:32616"))], picture)
     >>> picture.read_bytes()[1:4]

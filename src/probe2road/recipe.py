@@ -10,15 +10,15 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from probe2road.clean import CleanOptions, clean_graph
 from probe2road.errors import OptionError
 from probe2road.export import read_graph
 from probe2road.fleet import Fleet, TraceGaps
+from probe2road.graph.clean import CleanOptions, clean_graph
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.grid import Grid, read_raster, sparse_zeros
 from probe2road.picture import Stage, write_filmstrip
 from probe2road.raster import fleet_grid, rasterize, rasterize_windows
-from probe2road.refinement import RefineOptions, refine_graph
-from probe2road.roadgraph import RoadGraph
+from probe2road.refinement.recipe import RefineOptions, refine_graph
 from probe2road.segmentation.density import DensityOptions, density_segmenter
 from probe2road.segmentation.mask import threshold_mask
 from probe2road.segmentation.network import NetworkOptions, find_weights, network_segmenter

@@ -22,8 +22,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OptionError
+from probe2road.graph.roadgraph import RoadGraph, empty_graph
+from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.raster import Grid
-from probe2road.roadgraph import RoadGraph, empty_graph, empty_turns, finish_edges
 from probe2road.skeleton import skeleton_pixels
 from probe2road.tracing import PixelGraph, trace_pixels
 

@@ -27,12 +27,12 @@ from pyproj import CRS
 from probe2road.crs import WGS84, transform
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, TraceGaps
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.grid import Grid
 from probe2road.io.atomic import atomic_path
 from probe2road.io.graph_tables import outgoing
 from probe2road.io.graph_writers import geojson_features
 from probe2road.raster import rasterize
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["write_view"]
 
@@ -97,7 +97,7 @@ def write_view(
     --------
     >>> import tempfile
     >>> from pathlib import Path
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> page = Path(tempfile.mkdtemp()) / "roads.html"
     >>> graph = graph_from_lines([[(446000, 4636000), (446100, 4636000)]], crs="EPSG:32616")
     >>> write_view(graph, page, title="A & B")

@@ -15,10 +15,11 @@ from probe2road.baselines.biagioni.street_map import straight_pieces
 from probe2road.baselines.biagioni.traversals import Runs, good_runs, match_pieces, observe_trips
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.graph.check import check_graph
+from probe2road.graph.roadgraph import graph_from_lines
 from probe2road.grid import Grid
 from probe2road.matching.network import build_states
 from probe2road.matching.published import emission_table, transition
-from probe2road.roadgraph import check_graph, graph_from_lines
 
 CRS = "EPSG:32616"
 MODEL = BiagioniOptions().matcher

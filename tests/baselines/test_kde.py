@@ -15,8 +15,8 @@ from probe2road.baselines.volume_graph import graph_from_volume, voxel_links
 from probe2road.baselines.volume_skeleton import thin_volume
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.graph.check import check_graph
 from probe2road.grid import Grid
-from probe2road.roadgraph import check_graph
 
 CRS = "EPSG:32616"
 Volume = NDArray[np.bool_]

@@ -7,8 +7,8 @@ import pytest
 
 from probe2road.errors import InputError
 from probe2road.export import read_graph
+from probe2road.graph.check import check_graph
 from probe2road.io.osm import read_osm
-from probe2road.roadgraph import check_graph
 
 DATA = Path(os.environ.get("PROBE2ROAD_DATA", "../shared/data"))
 

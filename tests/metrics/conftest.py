@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from probe2road.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 
 CRS = "EPSG:32616"
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import shapely
 
+from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.metrics import AplsOptions, apls, comparable
-from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
 
 CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]

@@ -10,9 +10,10 @@ import pytest
 import shapely
 
 from probe2road.errors import InputError, OptionError
+from probe2road.graph.check import check_graph
+from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.metrics import METRICS, SCORE_DTYPES, GeoOptions, clip_graph, comparable, evaluate
 from probe2road.metrics.normalise import drop_twin_edges
-from probe2road.roadgraph import RoadGraph, check_graph, empty_graph, graph_from_lines
 
 CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]

@@ -10,13 +10,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from probe2road.errors import CRSError, OptionError
+from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.metrics import HE_BALAKRISHNAN_2022, GeoOptions, comparable, geo, scores_table
 from probe2road.metrics.geo import geo_networks, geo_samples
 from probe2road.metrics.matching import Matching, match_one_to_one
 from probe2road.metrics.network import network_from_graph
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import sample_edges
-from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
 
 CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import shapely
 
+from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.metrics import ItopoOptions, comparable, itopo
 from probe2road.metrics.itopo import itopo_pairs, project_nodes
 from probe2road.metrics.matching import candidate_pairs, match_one_to_one
 from probe2road.metrics.network import Network, network_from_graph
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import Centres, sample_around
-from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
 
 CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]

@@ -11,10 +11,10 @@ import shapely
 import shapely.affinity
 
 from probe2road.errors import OptionError
+from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.metrics import JunctionOptions, comparable, junction_pairs, junctions
 from probe2road.metrics.network import network_from_graph
 from probe2road.metrics.normalise import comparable_networks
-from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.simulate.generate import generate_interchange
 
 CRS = "EPSG:32616"

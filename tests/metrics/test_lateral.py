@@ -7,10 +7,10 @@ import pytest
 import shapely
 
 from probe2road.errors import OptionError
+from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.metrics import LateralOptions, comparable, lateral, lateral_gaps
 from probe2road.metrics.network import network_from_graph
 from probe2road.metrics.projection import project_along
-from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
 
 CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]

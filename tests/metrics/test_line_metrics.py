@@ -11,16 +11,10 @@ import numpy as np
 import pytest
 import shapely
 
-from probe2road.metrics import (
-    BufferGeoOptions,
-    GraphSamplingOptions,
-    buffer_geo,
-    comparable,
-    graph_sampling,
-)
+from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.metrics import BufferGeoOptions, GraphSamplingOptions, buffer_geo, comparable, graph_sampling
 from probe2road.metrics.network import network_from_graph
 from probe2road.metrics.sampling import Centres, sample_around
-from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
 
 CRS = "EPSG:32616"
 DATA = Path(os.environ.get("PROBE2ROAD_DATA", Path(__file__).parents[3] / "shared" / "data")) / "traces"

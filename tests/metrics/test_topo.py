@@ -6,11 +6,11 @@ import networkx as nx
 import numpy as np
 import pytest
 
+from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.metrics import TopoOptions, topo
 from probe2road.metrics.network import network_from_graph
 from probe2road.metrics.sampling import Centres, sample_around
 from probe2road.metrics.topo import _matched_marbles
-from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
 
 CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]

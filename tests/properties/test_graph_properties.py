@@ -12,9 +12,10 @@ from scipy.ndimage import gaussian_filter, label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from probe2road.clean import CleanOptions, clean_graph, merge_degree_two_nodes
+from probe2road.graph.check import check_graph
+from probe2road.graph.clean import CleanOptions, clean_graph, merge_degree_two_nodes
+from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.raster import Grid
-from probe2road.roadgraph import RoadGraph, check_graph, graph_from_lines
 from probe2road.skeleton import skeletonize, skeletonize_windows
 from probe2road.vectorize import VectorizeOptions, vectorize
 

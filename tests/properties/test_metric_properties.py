@@ -11,8 +11,8 @@ import shapely.affinity
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
+from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.metrics import GeoOptions, evaluate, geo, itopo, junctions, lateral
-from probe2road.roadgraph import RoadGraph, graph_from_lines
 
 CRS = "EPSG:32616"
 CHEAP = ["geo", "itopo", "buffer_geo", "graph_sampling"]

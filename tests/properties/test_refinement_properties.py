@@ -10,9 +10,11 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from probe2road.disambiguate import DisambiguateOptions, split_false_junctions
-from probe2road.gaps import GapOptions, fill_gaps, prune_gaps
-from probe2road.roadgraph import RoadGraph, check_graph, finish_edges, graph_from_lines
+from probe2road.graph.check import check_graph
+from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.tables import finish_edges
+from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, prune_gaps
+from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
 
 NOBODY = pd.DataFrame({"trace_id": [], "edge": [], "entered": [], "left": []})
 

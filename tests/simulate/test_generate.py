@@ -7,7 +7,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from probe2road.errors import OptionError
-from probe2road.roadgraph import check_graph
+from probe2road.graph.check import check_graph
 from probe2road.simulate.generate import INTERCHANGES, generate_corridor, generate_interchange, generate_town
 from probe2road.simulate.generate_curves import Pose, dubins, hermite, path_length, wander
 from probe2road.simulate.height_check import check_heights

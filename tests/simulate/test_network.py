@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from probe2road.errors import CRSError, InputError, OptionError
-from probe2road.roadgraph import check_graph
+from probe2road.graph.check import check_graph
 from probe2road.simulate.network import check_network, network_from_sections
 from probe2road.simulate.osm import read_network
 

@@ -16,14 +16,7 @@ from probe2road.alignment.floors import Floors, find_floors, floor_of, middles
 from probe2road.alignment.graph import optimise
 from probe2road.alignment.heights import solve_heights
 from probe2road.alignment.hypotheses import Track
-from probe2road.alignment.keyframes import (
-    Keyframes,
-    Sightings,
-    keyframes,
-    moved_aside,
-    recorded_aside,
-    sightings,
-)
+from probe2road.alignment.keyframes import Keyframes, Sightings, keyframes, moved_aside, recorded_aside, sightings
 from probe2road.alignment.lines import Condensed, Matches, condense, match_lines
 from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.profiles import ShiftSearch

@@ -13,11 +13,11 @@ from pathlib import Path
 from probe2road.baselines.volume import count_voxels, dense_pillars
 from probe2road.baselines.volume_graph import graph_from_volume
 from probe2road.baselines.volume_skeleton import thin_volume
-from probe2road.clean import CleanOptions, clean_graph
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, TraceGaps
+from probe2road.graph.clean import CleanOptions, clean_graph
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster import fleet_grid
-from probe2road.roadgraph import RoadGraph
 from probe2road.workspace import Progress, open_workspace, silent
 
 __all__ = ["KdeOptions", "build_kde"]

@@ -21,9 +21,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from probe2road.baselines.volume import Pillars
-from probe2road.clean import drop_edges, merge_degree_two_nodes
+from probe2road.graph.clean import drop_edges, merge_degree_two_nodes
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.grid import Grid
-from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
 
 __all__ = ["graph_from_volume", "voxel_links"]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from probe2road.errors import InputError, OptionError
-from probe2road.roadgraph import RoadGraph
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.simulate.network import RoadNetwork
 
 __all__ = ["MAIN_ROADS", "PRIMARY_ROADS", "labelled_reference", "main_roads"]
@@ -49,7 +49,7 @@ def labelled_reference(reference: RoadGraph, *, min_drives: int = 4) -> RoadGrap
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (90, 0)], [(90, 0), (90, 90)]], crs="EPSG:32616")
     >>> counted = replace(graph, edges=graph.edges.assign(support=[4, 3]))
     >>> labelled_reference(counted).edges.index.tolist(), labelled_reference(counted).nodes.index.tolist()

@@ -16,13 +16,13 @@ from rasterio.features import geometry_mask
 
 from probe2road.benchmark.tiles import TILE_SIZE
 from probe2road.comparison.intervals import COUNTS
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.grid import Grid
 from probe2road.labels import label_mask
 from probe2road.metrics.geo import GeoOptions, geo_samples
 from probe2road.metrics.itopo import ItopoOptions, itopo_pairs
 from probe2road.metrics.network import Network
 from probe2road.metrics.soft_f1 import soft_f1
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["geo_counts", "itopo_counts", "soft_counts"]
 
@@ -38,7 +38,7 @@ def geo_counts(proposal: Network, reference: Network, options: GeoOptions | None
     Examples
     --------
     >>> from probe2road.metrics.normalise import comparable_networks
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graphs = [graph_from_lines([[(900, 10), (end, 10)]], crs="EPSG:32616") for end in (1010, 1120)]
     >>> geo_counts(*comparable_networks(*graphs))[["proposal", "reference"]].to_dict("index")
     {'0_0': {'proposal': 10, 'reference': 10}, '1_0': {'proposal': 1, 'reference': 11}}

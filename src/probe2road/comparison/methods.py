@@ -11,8 +11,8 @@ from probe2road.baselines.biagioni.recipe import FLEET, build_biagioni
 from probe2road.baselines.deepmg.recipe import DeepMGOptions, build_deepmg
 from probe2road.baselines.kde import KdeOptions, build_kde
 from probe2road.errors import OptionError
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.recipe import BuildOptions, build
-from probe2road.roadgraph import RoadGraph
 from probe2road.segmentation.network import shipped_weights
 
 __all__ = ["METHODS", "Method", "find_methods"]

@@ -11,10 +11,10 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.fleet import Fleet
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.grid import Grid
 from probe2road.picture import Stage, write_filmstrip
 from probe2road.raster import rasterize
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["busiest_places", "draw_place"]
 
@@ -38,7 +38,7 @@ def busiest_places(reference: RoadGraph, count: int, *, size: float = 700.0) -> 
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> star = [[(0, 0), (90, 0)], [(0, 0), (-90, 0)], [(0, 0), (0, 90)]]
     >>> busiest_places(graph_from_lines(star, crs="EPSG:32616"), 3, size=100.0)
     [(-50.0, -50.0, 50.0, 50.0)]

@@ -23,9 +23,9 @@ from probe2road.benchmark.tiles import SPLITS, split_area
 from probe2road.errors import InputError, OptionError
 from probe2road.export import read_graph
 from probe2road.fleet import Fleet
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet_files
 from probe2road.io.fleet_writer import write_fleet
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["Source", "choose_drives", "make_fleet"]
 

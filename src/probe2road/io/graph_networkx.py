@@ -13,27 +13,14 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from probe2road.crs import WGS84, local_crs, parse_crs, require_metric, transform
+from probe2road.crs import local_crs, parse_crs, require_metric
 from probe2road.errors import CRSError, InputError
+from probe2road.graph.check import check_graph
+from probe2road.graph.networkx import present
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import EDGE_DTYPES, empty_turns, finish_edges, move_ends
 from probe2road.io.atomic import atomic_path
-from probe2road.io.graph_tables import (
-    OWN_COLUMNS,
-    crs_to_text,
-    edges_with_turns,
-    graph_from_edge_table,
-    outgoing,
-    text_value,
-    typed_column,
-)
-from probe2road.roadgraph import (
-    EDGE_DTYPES,
-    RoadGraph,
-    check_graph,
-    driving_direction,
-    empty_turns,
-    finish_edges,
-    move_ends,
-)
+from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table, outgoing, text_value, typed_column
 
 __all__ = ["from_networkx", "read_graphml", "to_networkx", "write_graphml"]
 
@@ -42,71 +29,8 @@ _END_TOLERANCE = 0.01  # m; ends of foreign edges this near their node are moved
 
 
 def to_networkx(graph: RoadGraph, *, min_count: int = 5) -> nx.MultiDiGraph:
-    """Return the graph as OSMnx has its graphs: a ``MultiDiGraph`` in the metric CRS.
-
-    An edge that is open both ways becomes two directed edges, the second with ``reversed`` true, its geometry
-    turned and its counts swapped; one-way edges become one (see `probe2road.roadgraph.driving_direction`).
-    Both carry the id in ``edge``. Missing values are left out. The result passes
-    ``osmnx.convert.validate_graph``, unless it is empty, which OSMnx does not allow.
-
-    Parameters
-    ----------
-    graph
-        The graph.
-    min_count
-        Traversals needed to call an edge one-way.
-
-    Returns
-    -------
-    networkx.MultiDiGraph
-        Nodes have ``x``, ``y`` (m), ``lon``, ``lat``, ``street_count``; edges ``osmid`` (the edge id where
-        there is none), ``length`` (m), ``oneway``, ``reversed``, ``geometry`` and the columns of the graph,
-        with the turns as text. A column ``oneway`` of the graph becomes ``oneway_tag``.
-
-    Examples
-    --------
-    >>> from probe2road.roadgraph import graph_from_lines
-    >>> directed = to_networkx(graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616"))
-    >>> sorted((u, v, data["reversed"], data["length"]) for u, v, data in directed.edges(data=True))
-    [(0, 1, False, 100.0), (1, 0, True, 100.0)]
-    """
-    result = nx.MultiDiGraph(crs=crs_to_text(graph.crs), created_with="probe2road")
-    result.add_nodes_from(zip(graph.nodes.index.tolist(), _present(_node_table(graph)), strict=True))
-
-    edges = edges_with_turns(graph)
-    edges = edges.rename(columns={"oneway": "oneway_tag"})
-    edges["osmid"] = edges["osmid"] if "osmid" in edges else edges["edge"]
-    direction = driving_direction(graph.edges, min_count=min_count).to_numpy()
-    edges["oneway"] = direction != 0
-    backward = edges.assign(
-        reversed=True,
-        geometry=shapely.reverse(edges.geometry.to_numpy()),
-        forward=edges["backward"],
-        backward=edges["forward"],
-    ).rename(columns={"u": "v", "v": "u"})
-    # Both directions of a loop join the same pair of nodes: the second needs a key of its own.
-    loop = (edges["u"] == edges["v"]).to_numpy() & (direction == 0)
-    backward.loc[loop, "key"] += edges["key"].max() + 1 if loop.any() else 0
-    for table in (edges.assign(reversed=False)[direction >= 0], backward[direction <= 0]):
-        ends = (table[name].tolist() for name in ("u", "v", "key"))
-        attributes = _present(pd.DataFrame(table.drop(columns=["u", "v", "key"])))
-        result.add_edges_from(zip(*ends, attributes, strict=True))
-    return result
-
-
-def _node_table(graph: RoadGraph) -> pd.DataFrame:
-    position = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
-    lon, lat = transform(position[:, 0], position[:, 1], graph.crs, WGS84)
-    return pd.DataFrame(graph.nodes.drop(columns="geometry")).assign(
-        x=position[:, 0], y=position[:, 1], lon=lon, lat=lat, street_count=graph.degrees()
-    )
-
-
-def _present(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return rows as dictionaries of Python values, without what is missing."""
-    columns = {str(name): table[name].astype(object).tolist() for name in table}
-    there = {str(name): table[name].notna().tolist() for name in table}
-    return [{name: columns[name][row] for name in columns if there[name][row]} for row in range(len(table))]
+    """Return an OSMnx ``MultiDiGraph``; see `probe2road.graph.networkx.to_networkx`."""
+    return graph.to_networkx(min_count=min_count)
 
 
 def from_networkx(graph: nx.Graph, *, target_crs: Any = None) -> RoadGraph:
@@ -299,4 +223,4 @@ def _typed_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         table[column] = (
             shapely.from_wkt(values.where(values.notna(), None)) if column == "geometry" else typed_column(values)
         )
-    return _present(table)
+    return present(table)

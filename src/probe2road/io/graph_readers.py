@@ -22,9 +22,9 @@ from pyproj import CRS
 
 from probe2road.crs import WGS84, local_crs, parse_crs, require_metric
 from probe2road.errors import CRSError, InputError
+from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table
 from probe2road.io.graph_writers import parquet_siblings
-from probe2road.roadgraph import RoadGraph, empty_graph, graph_from_lines
 
 __all__ = ["graph_from_table", "read_parquet_graph", "read_vector_graph"]
 

@@ -16,14 +16,14 @@ import numpy as np
 import pandas as pd
 import shapely
 from numpy.typing import NDArray
-from pyproj import CRS
 
 from probe2road.errors import InputError, OutputError
-from probe2road.roadgraph import (
+from probe2road.graph.check import check_graph
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import (
     EDGE_DTYPES,
     TURN_DTYPES,
-    RoadGraph,
-    check_graph,
+    TURNS_COLUMN,
     empty_turns,
     finish_edges,
     move_ends,
@@ -32,8 +32,6 @@ from probe2road.roadgraph import (
 
 __all__ = [
     "OWN_COLUMNS",
-    "crs_to_text",
-    "edges_with_turns",
     "graph_from_edge_table",
     "outgoing",
     "text_value",
@@ -41,7 +39,6 @@ __all__ = [
 ]
 
 OWN_COLUMNS = ("edge", "u", "v", "key", "origin")  # a table with these was written by us
-TURNS_COLUMN = "turns"
 
 _PRIVATE_NAME = re.compile(
     r"((trace|vehicle|drive|driver|trip|device|user)s?[_-]?(id|ids|uuid)?|vin|t|(first|last)?_?(seen|time|timestamp|date|datetime))s?",
@@ -63,7 +60,7 @@ def outgoing(graph: RoadGraph, *, where: object) -> RoadGraph:
     Examples
     --------
     >>> from dataclasses import replace
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (9, 0)]], crs="EPSG:32616")
     >>> outgoing(replace(graph, edges=graph.edges.assign(vehicle_id="A7")), where="roads.gpkg")
     Traceback (most recent call last):
@@ -106,26 +103,6 @@ def _uniform_dimension(lines: NDArray[Any]) -> NDArray[Any]:
         return lines
     coordinates, owner = shapely.get_coordinates(lines, include_z=True, return_index=True)
     return shapely.linestrings(coordinates, indices=owner)
-
-
-def edges_with_turns(graph: RoadGraph) -> gpd.GeoDataFrame:
-    """Return the edges with their id as a column and their turns as text ``to_edge@via_node:count``.
-
-    Examples
-    --------
-    >>> from dataclasses import replace
-    >>> from probe2road.roadgraph import graph_from_lines
-    >>> graph = graph_from_lines([[(0, 0), (9, 0)], [(9, 0), (9, 9)]], crs="EPSG:32616")
-    >>> turns = pd.DataFrame({"from_edge": [0, 0], "via_node": [1, 1], "to_edge": [1, 0], "count": [5, 2]})
-    >>> edges_with_turns(replace(graph, turns=turns))["turns"].tolist()
-    ['1@1:5 0@1:2', nan]
-    """
-    edges = graph.edges.reset_index()
-    if graph.turns.empty:
-        return edges
-    text = [f"{to}@{via}:{count}" for to, via, count in graph.turns[["to_edge", "via_node", "count"]].to_numpy()]
-    of_edge = pd.Series(text, dtype="str").groupby(graph.turns["from_edge"].to_numpy()).agg(" ".join)
-    return edges.assign(**{TURNS_COLUMN: edges["edge"].map(of_edge).astype("str")})
 
 
 def _turns_from_text(edges: pd.DataFrame) -> pd.DataFrame:
@@ -228,17 +205,3 @@ def typed_column(text: pd.Series) -> pd.Series:
         return pd.to_numeric(text)
     except (ValueError, TypeError):
         return text
-
-
-def crs_to_text(crs: CRS) -> str:
-    """Return the shortest text that `probe2road.crs.parse_crs` turns into an equal CRS.
-
-    Examples
-    --------
-    >>> crs_to_text(CRS.from_epsg(32616))
-    'EPSG:32616'
-    """
-    authority = crs.to_authority()
-    if authority is not None and CRS.from_authority(*authority) == crs:
-        return ":".join(authority)
-    return crs.to_json()

@@ -29,10 +29,11 @@ import pandas as pd
 import pyogrio
 import shapely
 
-from probe2road.crs import WGS84, transform
+from probe2road.crs import WGS84, crs_to_text, transform
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import edges_with_turns
 from probe2road.io.atomic import atomic_path
-from probe2road.io.graph_tables import crs_to_text, edges_with_turns, outgoing
-from probe2road.roadgraph import RoadGraph
+from probe2road.io.graph_tables import outgoing
 
 __all__ = [
     "geojson_features",
@@ -114,7 +115,11 @@ def write_flatgeobuf(graph: RoadGraph, path: str | PathLike[str]) -> None:
     graph = outgoing(graph, where=path)
     with atomic_path(path) as temporary:
         pyogrio.write_dataframe(
-            edges_with_turns(graph), temporary, layer="edges", driver="FlatGeobuf", geometry_type=_line_type(graph)
+            edges_with_turns(graph.edges, graph.turns),
+            temporary,
+            layer="edges",
+            driver="FlatGeobuf",
+            geometry_type=_line_type(graph),
         )
 
 
@@ -130,7 +135,7 @@ def write_geojson(graph: RoadGraph, path: str | PathLike[str]) -> None:
         If the file cannot be written or the graph holds private columns.
     """
     graph = outgoing(graph, where=path)
-    features = geojson_features(edges_with_turns(graph), decimals=GEOJSON_DECIMALS)
+    features = geojson_features(edges_with_turns(graph.edges, graph.turns), decimals=GEOJSON_DECIMALS)
     head = json.dumps({"type": "FeatureCollection", "probe2road": {"crs": crs_to_text(graph.crs)}})
     rows = ",\n".join(json.dumps(feature, separators=(",", ":"), allow_nan=False) for feature in features)
     with atomic_path(path) as temporary:

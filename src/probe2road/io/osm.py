@@ -21,19 +21,13 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from probe2road.crs import WGS84, local_crs, parse_crs, require_metric, transform
+from probe2road.crs import WGS84, crs_to_text, local_crs, parse_crs, require_metric, transform
 from probe2road.errors import InputError
+from probe2road.graph.direction import driving_direction
+from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.tables import edges_with_turns
 from probe2road.io.atomic import atomic_path
-from probe2road.io.graph_tables import (
-    OWN_COLUMNS,
-    crs_to_text,
-    edges_with_turns,
-    graph_from_edge_table,
-    outgoing,
-    text_value,
-    typed_column,
-)
-from probe2road.roadgraph import RoadGraph, driving_direction, graph_from_lines
+from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table, outgoing, text_value, typed_column
 
 __all__ = ["DRIVABLE", "read_osm", "write_osm"]
 
@@ -260,7 +254,7 @@ def _numbered_nodes(graph: RoadGraph) -> tuple[NDArray[np.float64], list[list[in
 
 def _way_tags(graph: RoadGraph) -> list[dict[str, str]]:
     """Return the tags of every edge."""
-    table = pd.DataFrame(edges_with_turns(graph).drop(columns=["geometry", "length"]))
+    table = pd.DataFrame(edges_with_turns(graph.edges, graph.turns).drop(columns=["geometry", "length"]))
     direction = driving_direction(graph.edges).map({1: "yes", -1: "-1"}).array
     plain = {"highway": "road", **{name: table[name].array for name in _KEPT_TAGS if name in table}}
     public = pd.DataFrame({**plain, "oneway": direction, "source": "probe2road"}, index=table.index)

@@ -14,14 +14,7 @@ from numpy.typing import NDArray
 from probe2road.matching.candidates import nearest_on_edge, new_scratch
 from probe2road.matching.network import Follow, States
 from probe2road.matching.routes import Labels, new_labels
-from probe2road.matching.viterbi import (
-    Candidates,
-    Observations,
-    Parameters,
-    decide,
-    find_candidates,
-    shortest,
-)
+from probe2road.matching.viterbi import Candidates, Observations, Parameters, decide, find_candidates, shortest
 
 __all__ = ["Paths", "match_over_routes"]
 

@@ -16,7 +16,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError
-from probe2road.roadgraph import RoadGraph, driving_direction
+from probe2road.graph.direction import driving_direction
+from probe2road.graph.roadgraph import RoadGraph
 
 __all__ = ["Follow", "Grid", "States", "build_follow", "build_states", "edge_weight_array"]
 
@@ -92,11 +93,11 @@ def build_states(graph: RoadGraph, *, respect_oneway: bool = True) -> States:
     """Turn a road graph into the states of map matching.
 
     Edges without length are kept: they are passed at no cost. With ``respect_oneway`` the directions that
-    `probe2road.roadgraph.driving_direction` closes are no states.
+    `probe2road.graph.direction.driving_direction` closes are no states.
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> states = build_states(graph_from_lines([[(0, 0), (9, 0)], [(9, 0), (9, 4), (5, 4)]], crs="EPSG:32616"))
     >>> states.tail.tolist(), states.head.tolist(), states.along.tolist()
     ([0, 1, 1, 2], [1, 0, 2, 1], [0.0, 0.0, 4.0])

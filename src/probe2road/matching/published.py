@@ -106,7 +106,7 @@ def transition(
     The example of METHOD 11: of three edges at a node one is a gap edge of weight 0.1.
 
     >>> from probe2road.matching.network import build_states
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> lines = [[(0, 0), (9, 0)], [(9, 0), (18, 0)], [(9, 0), (9, 9)]]
     >>> states = build_states(graph_from_lines(lines, crs="EPSG:32616"))
     >>> weight = np.array([1.0, 1.0, 0.1])

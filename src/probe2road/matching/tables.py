@@ -9,9 +9,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.fleet import Fleet
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.chains import Paths
 from probe2road.matching.network import States
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["fix_table", "joined_paths", "step_table"]
 

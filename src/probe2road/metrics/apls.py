@@ -14,11 +14,11 @@ import shapely
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.metrics.matching import require_positive
 from probe2road.metrics.network import EPSILON, Network, locate, shortest_arcs
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.scores import Score
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["AplsOptions", "apls", "apls_networks"]
 
@@ -70,7 +70,7 @@ def apls(proposal: RoadGraph, reference: RoadGraph, options: AplsOptions | None 
     --------
     A gap in the middle cuts the routes through it:
 
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> reference = graph_from_lines([[(0, 0), (200, 0)]], crs="EPSG:32616")
     >>> proposal = graph_from_lines([[(0, 0), (90, 0)], [(110, 0), (200, 0)]], crs="EPSG:32616")
     >>> score = apls(proposal, reference)

@@ -8,11 +8,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.metrics.matching import require_positive
 from probe2road.metrics.network import Network
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.scores import Score
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["BufferGeoOptions", "buffer_geo", "buffer_geo_networks"]
 
@@ -59,7 +59,7 @@ def buffer_geo(proposal: RoadGraph, reference: RoadGraph, options: BufferGeoOpti
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> reference = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (0, 0)]], crs="EPSG:32616")
     >>> proposal = graph_from_lines([[(0, 7), (50, 7)]], crs="EPSG:32616")
     >>> [(score.precision, score.recall, score.reference) for score in buffer_geo(proposal, reference)][:2]

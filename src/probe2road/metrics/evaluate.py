@@ -10,6 +10,7 @@ from typing import Any
 import pandas as pd
 
 from probe2road.errors import OptionError
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.metrics.apls import AplsOptions, apls_networks
 from probe2road.metrics.buffer import BufferGeoOptions, buffer_geo_networks
 from probe2road.metrics.geo import GeoOptions, geo_networks
@@ -20,7 +21,6 @@ from probe2road.metrics.lateral import LateralOptions, lateral_networks
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.scores import Score, scores_table
 from probe2road.metrics.topo import TopoOptions, topo_networks
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["DEFAULT_METRICS", "METRICS", "MetricOptions", "evaluate"]
 
@@ -100,7 +100,7 @@ def evaluate(
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 50)]], crs="EPSG:32616")
     >>> evaluate(graph, graph, metrics=["geo", GeoOptions(radius=15.0)])[["metric", "f1", "reference"]]
       metric   f1  reference

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe2road.errors import OptionError
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.metrics.matching import Matching, candidate_pairs, match_one_to_one, require_positive
 from probe2road.metrics.network import Network
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import Samples, sample_edges
 from probe2road.metrics.scores import Score
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["HE_BALAKRISHNAN_2022", "GeoOptions", "GeoSamples", "geo", "geo_networks", "geo_samples"]
 
@@ -88,7 +88,7 @@ def geo(proposal: RoadGraph, reference: RoadGraph, options: GeoOptions | None = 
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> proposal = graph_from_lines([[(0, 0), (6, 0)]], crs="EPSG:32616")
     >>> reference = graph_from_lines([[(0, 0), (6, 0), (12, 0)]], crs="EPSG:32616")
     >>> print(geo(proposal, reference))
@@ -125,7 +125,7 @@ def geo_samples(proposal: Network, reference: Network, options: GeoOptions) -> G
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> sides = [graph_from_lines([[(0, 0), (end, 0)]], crs="EPSG:32616") for end in (6, 12)]
     >>> samples = geo_samples(*comparable_networks(*sides), GeoOptions())
     >>> samples.reference_xy[:, 0].tolist(), samples.reference_matched.tolist()

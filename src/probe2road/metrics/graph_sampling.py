@@ -7,12 +7,12 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from probe2road.errors import OptionError
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.metrics.matching import Matching, candidate_pairs, match_one_to_one, require_positive
 from probe2road.metrics.network import Network
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import Centres, Samples, component_roots, sample_around
 from probe2road.metrics.scores import Score
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["GraphSamplingOptions", "graph_sampling", "graph_sampling_networks"]
 
@@ -72,7 +72,7 @@ def graph_sampling(
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> reference = graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616")
     >>> proposal = graph_from_lines([[(0, 7), (50, 7)]], crs="EPSG:32616")
     >>> [(score.precision, round(score.recall, 3)) for score in graph_sampling(proposal, reference)]

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from probe2road.errors import OptionError
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.metrics.matching import require_positive
 from probe2road.metrics.network import EPSILON, Network, locate
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import Centres, Samples, sample_around
 from probe2road.metrics.scores import Score, ratio
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["ItopoOptions", "Pairs", "itopo", "itopo_networks", "itopo_pairs"]
 
@@ -104,7 +104,7 @@ def itopo(proposal: RoadGraph, reference: RoadGraph, options: ItopoOptions | Non
     --------
     A junction where the reference has two roads, one above the other:
 
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> arms = [[(0, 0), (90, 0)], [(0, 0), (-90, 0)], [(0, 0), (0, 90)], [(0, 0), (0, -90)]]
     >>> proposal = graph_from_lines(arms, crs="EPSG:32616")
     >>> reference = graph_from_lines([[(-90, 0), (90, 0)], [(0, -90), (0, 90)]], crs="EPSG:32616")

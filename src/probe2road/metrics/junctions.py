@@ -16,12 +16,12 @@ import shapely
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.metrics.matching import require_positive
 from probe2road.metrics.network import EPSILON, Network, locate, shortest_arcs
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.projection import direction_over, project_along
 from probe2road.metrics.scores import Score
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["JunctionOptions", "JunctionPairs", "junction_pairs", "junctions", "junctions_networks"]
 
@@ -119,7 +119,7 @@ def junctions(proposal: RoadGraph, reference: RoadGraph, options: JunctionOption
     --------
     A bridge that is taken for a junction: of six pairs of arms two connect.
 
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> arms = [[(0, 0), (90, 0)], [(0, 0), (-90, 0)], [(0, 0), (0, 90)], [(0, 0), (0, -90)]]
     >>> proposal = graph_from_lines(arms, crs="EPSG:32616")
     >>> reference = graph_from_lines([[(-90, 0), (90, 0)], [(0, -90), (0, 90)]], crs="EPSG:32616")

@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.metrics.matching import require_positive
 from probe2road.metrics.network import EPSILON, Network, locate
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.projection import direction_over, project_along
 from probe2road.metrics.sampling import sample_edges
 from probe2road.metrics.scores import Score
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["LateralOptions", "lateral", "lateral_gaps", "lateral_networks"]
 
@@ -64,7 +64,7 @@ def lateral(proposal: RoadGraph, reference: RoadGraph, options: LateralOptions |
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> reference = graph_from_lines([[(0, 0), (200, 0)]], crs="EPSG:32616")
     >>> proposal = graph_from_lines([[(0, 1.5), (100, 1.5)], [(150, 0), (150, 100)]], crs="EPSG:32616")
     >>> score = lateral(proposal, reference)

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from probe2road.roadgraph import RoadGraph
+from probe2road.graph.roadgraph import RoadGraph
 
 __all__ = ["EPSILON", "Network", "locate", "network_from_graph", "shortest_arcs"]
 
@@ -70,7 +70,7 @@ def network_from_graph(graph: RoadGraph) -> Network:
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> network = network_from_graph(graph_from_lines([[(0, 0), (3, 4)], [(3, 4), (3, 9), (0, 9)]], crs="EPSG:32616"))
     >>> network.length.tolist(), network.along.tolist(), network.degree.tolist()
     ([5.0, 8.0], [0.0, 5.0, 0.0, 5.0, 8.0], [1, 2, 1])
@@ -139,7 +139,7 @@ def locate(
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> network = network_from_graph(graph_from_lines([[(0, 0), (4, 0), (4, 6)]], crs="EPSG:32616"))
     >>> xy, direction = locate(network, np.array([0, 0]), np.array([3.0, 9.0]))
     >>> xy.tolist(), direction.tolist()

@@ -12,11 +12,12 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from probe2road.clean import merge_degree_two_nodes
 from probe2road.crs import require_metric
 from probe2road.errors import InputError
+from probe2road.graph.clean import merge_degree_two_nodes
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.metrics.network import EPSILON, Network, locate, network_from_graph
-from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
 
 __all__ = ["clip_graph", "comparable", "comparable_networks", "drop_twin_edges"]
 
@@ -81,7 +82,7 @@ def drop_twin_edges(graph: RoadGraph) -> RoadGraph:
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> lines = [[(0, 0), (9, 0)], [(9, 0), (0, 0)], [(0, 0), (4, 4), (9, 0)]]
     >>> drop_twin_edges(graph_from_lines(lines, crs="EPSG:32616")).edges["length"].round(1).tolist()
     [9.0, 12.1]
@@ -120,7 +121,7 @@ def clip_graph(graph: RoadGraph, area: Any) -> RoadGraph:
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 50)]], crs="EPSG:32616")
     >>> clip_graph(graph, (40, -10, 120, 20)).edges["length"].tolist()
     [60.0, 20.0]

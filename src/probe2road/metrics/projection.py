@@ -48,7 +48,7 @@ def project_along(
     The edge across is nearer, but runs the other way:
 
     >>> from probe2road.metrics.network import network_from_graph
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> network = network_from_graph(graph_from_lines([[(20, -50), (20, 50)], [(0, 3), (50, 3)]], crs="EPSG:32616"))
     >>> point, east = np.array([[19.0, 0.0]]), np.array([[1.0, 0.0]])
     >>> [part.tolist() for part in project_along(point, east, network, radius=6.0, max_angle=30.0)]
@@ -81,7 +81,7 @@ def direction_over(
     Examples
     --------
     >>> from probe2road.metrics.network import network_from_graph
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> network = network_from_graph(graph_from_lines([[(0, 0), (4, 0), (4, 4)]], crs="EPSG:32616"))
     >>> place = np.array([0]), np.array([4.0])
     >>> direction_over(network, *place, 0.0).tolist(), direction_over(network, *place, 2.0).round(3).tolist()

@@ -101,7 +101,7 @@ def sample_edges(network: Network, spacing: float, *, shift: float | None = None
     Examples
     --------
     >>> from probe2road.metrics.network import network_from_graph
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> network = network_from_graph(graph_from_lines([[(0, 0), (12, 0)]], crs="EPSG:32616"))
     >>> sample_edges(network, 5.0).xy[:, 0].tolist()
     [0.0, 5.0, 10.0, 12.0]
@@ -145,7 +145,7 @@ def sample_around(network: Network, centres: Centres, *, radius: float, spacing:
     Examples
     --------
     >>> from probe2road.metrics.network import network_from_graph
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> network = network_from_graph(graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616"))
     >>> centre = Centres.from_positions(np.array([0]), np.array([15.0]))
     >>> sorted(sample_around(network, centre, radius=30.0, spacing=11.0).xy[:, 0].tolist())
@@ -164,7 +164,7 @@ def component_roots(network: Network) -> NDArray[np.int64]:
     Examples
     --------
     >>> from probe2road.metrics.network import network_from_graph
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> lines = [[(0, 0), (9, 0)], [(50, 0), (60, 0)], [(9, 0), (9, 9)]]
     >>> component_roots(network_from_graph(graph_from_lines(lines, crs="EPSG:32616"))).tolist()
     [0, 2]

@@ -13,13 +13,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.metrics.matching import match_one_to_one, require_positive
 from probe2road.metrics.network import EPSILON, Network
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.projection import project_along
 from probe2road.metrics.sampling import Centres, Samples, component_roots, sample_around
 from probe2road.metrics.scores import Score, ratio
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["TopoOptions", "topo", "topo_networks"]
 
@@ -75,7 +75,7 @@ def topo(proposal: RoadGraph, reference: RoadGraph, options: TopoOptions | None 
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> reference = graph_from_lines([[(0, 0), (1000, 0)]], crs="EPSG:32616")
     >>> proposal = graph_from_lines([[(0, 2), (500, 2)]], crs="EPSG:32616")
     >>> score = topo(proposal, reference)

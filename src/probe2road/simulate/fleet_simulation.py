@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from probe2road.errors import OptionError
 from probe2road.fleet import POINT_KINDS, Fleet
-from probe2road.roadgraph import RoadGraph
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.simulate.camera import ROAD_BOUNDARY, Detections, FeatureIndex, feature_index, see
 from probe2road.simulate.features import RoadFeatures, road_features
 from probe2road.simulate.gnss import gnss_errors

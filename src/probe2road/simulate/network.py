@@ -20,7 +20,8 @@ from pyproj import CRS
 
 from probe2road.crs import parse_crs, require_metric
 from probe2road.errors import InputError, OptionError
-from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.simulate.road_classes import CLASS_DEFAULTS, MarkingStyle, marking_style
 
 __all__ = [

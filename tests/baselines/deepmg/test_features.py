@@ -6,13 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe2road.baselines.deepmg.features import (
-    PLANES,
-    FeatureOptions,
-    Steps,
-    extract_features,
-    thin_traces,
-)
+from probe2road.baselines.deepmg.features import PLANES, FeatureOptions, Steps, extract_features, thin_traces
 from probe2road.baselines.deepmg.variants import find_variant
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, fleet_from_tables

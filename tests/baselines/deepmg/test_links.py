@@ -18,7 +18,8 @@ from probe2road.baselines.deepmg.links import (
 )
 from probe2road.baselines.deepmg.variants import find_variant
 from probe2road.errors import OptionError
-from probe2road.roadgraph import RoadGraph, check_graph, graph_from_lines
+from probe2road.graph.check import check_graph
+from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 
 FIXED, PUBLISHED = find_variant("fixed"), find_variant("as_published")
 CENTRAL = 500_000.0  # easting of the middle of the zone

@@ -13,7 +13,7 @@ from probe2road.baselines.deepmg.pruning import PruneOptions, prune_graph
 from probe2road.baselines.deepmg.traversals import MatcherOptions, count_traversals
 from probe2road.errors import OptionError
 from probe2road.fleet import fleet_from_tables
-from probe2road.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 
 CRS = "EPSG:32616"
 

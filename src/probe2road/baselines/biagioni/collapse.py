@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from shapely import LineString
 
 from probe2road.baselines.biagioni.traversals import Runs
-from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import empty_turns, finish_edges
 
 __all__ = ["collapse_segments", "run_errors"]
 
@@ -67,7 +68,7 @@ def collapse_segments(graph: RoadGraph, runs: Runs, *, max_length: float, max_er
     Two side roads, one with a run, meet a third road at a distance. Where they are 8 m apart, one crossing serves
     the run as well; where they are 40 m apart, it would be 13 m off:
 
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> drive = np.array([[0.0, 20.0], [0.0, 30.0], [0.0, 40.0]])
     >>> runs = Runs(np.array([3]), np.array([True]), np.array([0, 3]), drive)
     >>> for gap in (8, 40):

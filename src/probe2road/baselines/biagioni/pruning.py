@@ -10,9 +10,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.baselines.biagioni.traversals import Runs
-from probe2road.clean import merge_degree_two_nodes
-from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
-from probe2road.topology import chains, mates
+from probe2road.graph.clean import merge_degree_two_nodes
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import empty_turns, finish_edges
+from probe2road.graph.topology import chains, mates
 
 __all__ = ["prune_segments"]
 
@@ -50,7 +51,7 @@ def prune_segments(graph: RoadGraph, runs: Runs, *, min_runs: int) -> tuple[Road
     --------
     The road in the middle was driven once in either direction; the others are joined around it:
 
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> lines = [[(0, 0), (90, 0)], [(90, 0), (180, 0)], [(90, 0), (90, 90)]]
     >>> runs = Runs(np.array([0, 0, 1, 1, 2, 2]), np.array([1, 1, 1, 1, 1, 0]) == 1, np.arange(7), np.zeros((6, 2)))
     >>> kept, runs = prune_segments(graph_from_lines(lines, crs="EPSG:32616"), runs, min_runs=2)

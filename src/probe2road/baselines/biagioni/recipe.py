@@ -21,10 +21,10 @@ from probe2road.baselines.biagioni.street_map import initial_map, straight_piece
 from probe2road.baselines.biagioni.traversals import Observations, Runs, good_runs, match_pieces, observe_trips
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, TraceGaps
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.grid import Grid
 from probe2road.matching.models import PublishedModel
 from probe2road.raster import fleet_grid
-from probe2road.roadgraph import RoadGraph
 from probe2road.workspace import Progress, Workspace, open_workspace, silent
 
 __all__ = ["FLEET", "SIGMAS", "BiagioniOptions", "build_biagioni"]

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from probe2road.baselines.biagioni.density import LEVELS
 from probe2road.baselines.fringe import trace_fringe
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.grid import Grid
-from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
 from probe2road.vectorize import VectorizeOptions, graph_from_pixels
 
 __all__ = ["Pieces", "initial_map", "straight_pieces"]
@@ -72,7 +73,7 @@ def straight_pieces(graph: RoadGraph) -> Pieces:
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> pieces = straight_pieces(graph_from_lines([[(0, 0), (9, 0)], [(9, 0), (9, 9), (0, 9)]], crs="EPSG:32616"))
     >>> pieces.segment.tolist(), pieces.graph.edges[["u", "v"]].values.tolist()
     ([0, 1, 1], [[0, 1], [1, 3], [3, 2]])

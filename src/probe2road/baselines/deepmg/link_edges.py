@@ -21,8 +21,9 @@ from probe2road.baselines.deepmg.links import (
     propose_links,
 )
 from probe2road.baselines.deepmg.variants import Variant
-from probe2road.roadgraph import RoadGraph, finish_edges
-from probe2road.splitting import split_edges
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.splitting import split_edges
+from probe2road.graph.tables import finish_edges
 
 __all__ = ["add_links", "choose_links"]
 
@@ -49,7 +50,7 @@ def add_links(graph: RoadGraph, variant: Variant, options: LinkOptions | None = 
     Examples
     --------
     >>> from probe2road.baselines.deepmg.variants import find_variant
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(50, -90), (50, -20)]], crs="EPSG:32616")
     >>> add_links(graph, find_variant("fixed")).edges[["origin", "length"]].values.tolist()
     [['segmentation', 50.0], ['segmentation', 70.0], ['segmentation', 50.0], ['gap', 20.0]]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from probe2road.baselines.deepmg.variants import Variant
 from probe2road.crs import WGS84, transform
 from probe2road.errors import OptionError
-from probe2road.roadgraph import RoadGraph
+from probe2road.graph.roadgraph import RoadGraph
 
 __all__ = ["NO_NODE", "Link", "LinkOptions", "angle_stretch", "bearing_difference", "propose_links"]
 
@@ -108,7 +108,7 @@ def propose_links(graph: RoadGraph, variant: Variant, options: LinkOptions | Non
     Examples
     --------
     >>> from probe2road.baselines.deepmg.variants import find_variant
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(50, -90), (50, -20)]], crs="EPSG:32616")
     >>> [(link.edge, link.along, link.length) for link in propose_links(graph, find_variant("fixed"))]
     [(0, 50.0, 20.0)]

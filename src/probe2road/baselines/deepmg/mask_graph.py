@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from probe2road.baselines.deepmg.variants import Variant
 from probe2road.baselines.fringe import trace_fringe
-from probe2road.clean import drop_dead_ends
+from probe2road.graph.clean import drop_dead_ends
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import finish_edges
 from probe2road.grid import Grid
-from probe2road.roadgraph import RoadGraph, finish_edges
 from probe2road.skeleton import skeletonize_windows
 from probe2road.vectorize import VectorizeOptions, graph_from_pixels, vectorize
 

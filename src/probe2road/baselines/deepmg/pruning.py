@@ -10,7 +10,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.errors import OptionError
-from probe2road.roadgraph import RoadGraph, empty_turns, finish_edges
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.tables import empty_turns, finish_edges
 
 __all__ = ["PruneOptions", "prune_graph"]
 
@@ -51,7 +52,7 @@ def prune_graph(graph: RoadGraph, traversals: NDArray[np.int64], options: PruneO
 
     Examples
     --------
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (90, 0)], [(90, 0), (90, 50)], [(90, 0), (99, 0)]], crs="EPSG:32616")
     >>> pruned = prune_graph(graph, np.array([[3, 0], [0, 0], [0, 2]]))
     >>> pruned.edges[["forward", "backward", "oneway"]].values.tolist()

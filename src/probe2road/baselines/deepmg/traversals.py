@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 
 from probe2road.baselines.deepmg.features import Steps
 from probe2road.errors import OptionError
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.candidates import Scratch, nearest_points, new_scratch
 from probe2road.matching.network import Follow, States, build_follow, build_states
 from probe2road.matching.routes import Labels, new_labels, search
-from probe2road.roadgraph import RoadGraph
 
 __all__ = ["MatcherOptions", "count_traversals"]
 
@@ -101,7 +101,7 @@ def count_traversals(
     >>> import pandas as pd
     >>> from probe2road.baselines.deepmg.features import thin_traces
     >>> from probe2road.fleet import fleet_from_tables
-    >>> from probe2road.roadgraph import graph_from_lines
+    >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(200, 0), (100, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(5), "x": [20.0, 60, 90, 130, 170], "y": [1.0, 0, 2, 0, 1]})
     >>> steps = thin_traces(fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616"))

@@ -1,0 +1,1 @@
+"""Traces refine a graph: gaps filled, false junctions split, edges moved and counted."""

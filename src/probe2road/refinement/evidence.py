@@ -1,0 +1,287 @@
+"""Evidence: what the matched drives say about every edge and every turn.
+
+Only numbers leave here: how many traces, drives and vehicles, never which, and never when.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.special import betaln
+
+from probe2road.crs import same_crs
+from probe2road.edge_frame import FramedFixes, Traversals, edge_lines, frame, robust_sigma
+from probe2road.errors import CRSError, OptionError
+from probe2road.fleet import Fleet
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.mapmatch import Matches, turn_counts
+from probe2road.refinement.heights import HeightOptions, with_heights
+
+__all__ = ["EVIDENCE_COLUMNS", "EvidenceOptions", "add_evidence", "drive_numbers", "oneway_probabilities"]
+
+logger = logging.getLogger(__name__)
+
+EVIDENCE_COLUMNS = (
+    "support",  # distinct traces
+    "drive_support",  # distinct drives
+    "vehicle_support",  # distinct vehicles; NA where the fleet does not name them
+    "forward",  # traversals from u to v
+    "backward",  # traversals from v to u
+    "oneway",  # "yes" from u to v, "-1" from v to u, "no", or missing where the counts leave it open
+    "oneway_confidence",  # probability of that value, or of the most probable one
+    "speed",  # m/s, metres driven by seconds spent, stops included
+    "spread",  # m, 1 sigma of the fixes across the road
+    "height_spread",  # m, 1 sigma of the heights about the profile
+)
+
+_TURNED = ("yes", "-1", "no")
+
+
+@dataclass(frozen=True)
+class EvidenceOptions:
+    """What counts as having driven an edge, and how its properties are estimated."""
+
+    min_cover: float = 15.0  # m of an edge, or half of a shorter one, that a traversal has to cover
+    drive_pause: float = 300.0  # s; traces of one vehicle that follow each other sooner are one drive
+    min_confidence: float = 0.9  # probability from which oneway gets a value
+    wrong_way: float = 0.02  # share of traversals of a one-way road that are matched the wrong way
+    imbalance: float = 2.0  # a of Beta(a, a), the law of the share of one direction on two-way roads
+    oneway_share: float = 0.5  # of edges that are one-way, before anything was counted
+    max_interval: float = 60.0  # s; longer intervals between fixes do not count for the speed
+    heights: HeightOptions = field(default_factory=HeightOptions)  # how heights are estimated
+
+    def __post_init__(self) -> None:
+        """Refuse negative numbers, and probabilities that are none or certain."""
+        for name in ("min_cover", "drive_pause", "max_interval"):
+            if not getattr(self, name) >= 0:
+                fix = "use a number that is not negative"
+                raise OptionError(f"{name} is {getattr(self, name)}", where="EvidenceOptions", fix=fix)
+        for name in ("min_confidence", "wrong_way", "oneway_share"):
+            if not 0 < getattr(self, name) < 1:
+                fix = "use a number between 0 and 1"
+                raise OptionError(f"{name} is {getattr(self, name)}", where="EvidenceOptions", fix=fix)
+        if not self.imbalance > 0:
+            raise OptionError(f"imbalance is {self.imbalance}", where="EvidenceOptions", fix="use a positive number")
+
+
+def add_evidence(
+    graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: EvidenceOptions | None = None
+) -> RoadGraph:
+    """Write into a graph what the matched drives say about its edges and turns.
+
+    Counts are 0, and measured values missing, where nobody drove. A value of ``oneway`` that the graph has already is
+    kept, because a sign outranks traffic; its ``oneway_confidence`` then says how well traffic agrees. Heights replace
+    those of the graph where the fleet has any, and vertices are added where the profile bends; the course in plan
+    stays the same to the last bit.
+
+    Parameters
+    ----------
+    graph
+        The graph that was matched on.
+    fleet
+        The fleet that was matched.
+    matches
+        From `probe2road.mapmatch.match`.
+    options
+        The defaults where it is None.
+
+    Returns
+    -------
+    RoadGraph
+        With `EVIDENCE_COLUMNS` and the turn table filled in.
+
+    Raises
+    ------
+    CRSError
+        If fleet and graph are in different CRS.
+    InputError
+        If the matches belong to another fleet or graph.
+
+    Examples
+    --------
+    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.mapmatch import match
+    >>> from probe2road.graph.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 80)]], crs="EPSG:32616")
+    >>> table = pd.DataFrame({"trace_id": 1, "t": range(4), "x": [80.0, 60, 40, 20], "y": 0.0, "z": 7.0})
+    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> known = add_evidence(graph, fleet, match(fleet, graph))
+    >>> known.edges[["support", "forward", "backward", "speed"]].values.tolist()
+    [[1, 0, 1, 20.0], [0, 0, 0, nan]]
+    >>> print(known.edges.geometry[0])
+    LINESTRING Z (0 0 7, 100 0 7)
+    """
+    options = options or EvidenceOptions()
+    if not same_crs(fleet.crs, graph.crs):
+        fault = f"the traces are in {fleet.crs.name}, the graph is in {graph.crs.name}"
+        raise CRSError(fault, where="add_evidence", fix="reproject one of them, for example with graph.to_crs")
+    driven, fixes = frame(graph, fleet, matches)
+    counted = _counts(graph, fleet, driven, options)
+    measured = {
+        "speed": _speeds(graph, fleet, driven, fixes, options.max_interval),
+        "spread": robust_sigma(fixes.left, driven.edge[fixes.traversal], len(graph.edges)),
+    }
+    edges = graph.edges.assign(**counted, **measured)
+    known = replace(graph, edges=edges.assign(**_oneway(edges, options)), turns=turn_counts(matches, graph))
+    known = with_heights(known, fleet, driven, fixes, options=options.heights)
+    logger.info(
+        "%d of %d edges and %d turns were driven; %d edges are one-way, %d are not",
+        int((edges["support"] > 0).sum()), len(edges), len(known.turns),
+        int(known.edges["oneway"].isin(_TURNED[:2]).sum()), int((known.edges["oneway"] == "no").sum()),
+    )  # fmt: skip
+    return known
+
+
+def drive_numbers(fleet: Fleet, *, pause: float = 300.0) -> NDArray[np.int64]:
+    """Tell which traces are one drive: those of one vehicle that follow each other after at most a pause (s).
+
+    Fleets often cut a drive into several traces. Where vehicles or times are unknown, every trace is a drive.
+
+    Returns
+    -------
+    ndarray of int64, shape (traces,)
+
+    Examples
+    --------
+    >>> from probe2road.fleet import fleet_from_tables
+    >>> times = pd.to_datetime(["08:00", "08:10", "08:12", "08:20", "09:00", "09:10"], format="%H:%M", utc=True)
+    >>> table = pd.DataFrame({"trace_id": [1, 1, 2, 2, 3, 3], "vehicle_id": "A", "t": times, "x": 500.0, "y": 0.0})
+    >>> fleet = fleet_from_tables(table.assign(x=table.index + 500.0), crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> drive_numbers(fleet).tolist()
+    [0, 0, 1]
+    """
+    starts = fleet.starts
+    table = fleet.traces
+    number = np.arange(len(starts) - 1)
+    if "vehicle_id" not in table or not len(number):
+        return number
+    spans = pd.DataFrame(
+        {
+            "vehicle": table["vehicle_id"].to_numpy()[starts[:-1]],
+            "begin": table["t"].to_numpy("datetime64[ns]")[starts[:-1]],
+            "end": table["t"].to_numpy("datetime64[ns]")[starts[1:] - 1],
+        }
+    ).sort_values(["vehicle", "begin"], kind="stable", na_position="first")
+    ended = spans.groupby("vehicle")["end"].cummax().shift(1)
+    follows = spans["vehicle"].eq(spans["vehicle"].shift(1)) & spans["vehicle"].notna()
+    follows &= (spans["begin"] - ended) <= pd.Timedelta(seconds=pause)  # False for unknown times
+    drive = pd.Series((~follows).cumsum(), index=spans.index).sort_index()
+    return pd.factorize(drive)[0].astype(np.int64)
+
+
+def oneway_probabilities(
+    forward: NDArray[np.float64], backward: NDArray[np.float64], *, options: EvidenceOptions | None = None
+) -> NDArray[np.float64]:
+    """Return the probabilities that edges are one-way from u to v, one-way from v to u, or open both ways.
+
+    Bayes' law for three models of how traversals fall on the two directions: all but a few wrongly matched ones on
+    one, or on both in a share that follows a Beta distribution.
+
+    Parameters
+    ----------
+    forward, backward
+        Shape (n,): traversals.
+    options
+        ``wrong_way``, ``imbalance``, ``oneway_share``.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+
+    Examples
+    --------
+    >>> oneway_probabilities(np.array([0.0, 9, 9]), np.array([0.0, 0, 4])).round(2).tolist()
+    [[0.25, 0.25, 0.5], [0.9, 0.0, 0.1], [0.01, 0.0, 0.99]]
+    """
+    options = options or EvidenceOptions()
+    wrong = 1.0 / options.wrong_way - 1.0  # b of Beta(1, b), whose mean is the share
+    even = options.imbalance
+    log = np.stack(
+        [
+            np.log(options.oneway_share / 2) + betaln(forward + wrong, backward + 1.0) - betaln(wrong, 1.0),
+            np.log(options.oneway_share / 2) + betaln(forward + 1.0, backward + wrong) - betaln(1.0, wrong),
+            np.log(1 - options.oneway_share) + betaln(forward + even, backward + even) - betaln(even, even),
+        ],
+        axis=-1,
+    )
+    likelihood = np.exp(log - log.max(axis=-1, keepdims=True))
+    return likelihood / likelihood.sum(axis=-1, keepdims=True)
+
+
+def _counts(
+    graph: RoadGraph, fleet: Fleet, driven: Traversals, options: EvidenceOptions
+) -> dict[str, pd.arrays.IntegerArray]:
+    """Count distinct traces, drives and vehicles, and traversals each way, per edge."""
+    length = edge_lines(graph).length[driven.edge]
+    enough = driven.high - driven.low >= np.minimum(options.min_cover, length / 2)
+    edge, trace, forward = driven.edge[enough], driven.trace[enough], driven.forward[enough]
+    n = len(graph.edges)
+
+    def distinct(who: NDArray[np.int64]) -> NDArray[np.int64]:
+        pairs = np.unique(np.stack([edge, who]), axis=1)
+        return np.bincount(pairs[0, pairs[1] >= 0], minlength=n)
+
+    drives = drive_numbers(fleet, pause=options.drive_pause)
+    counts = {
+        "support": distinct(trace),
+        "drive_support": distinct(drives[trace]),
+        "forward": np.bincount(edge[forward], minlength=n),
+        "backward": np.bincount(edge[~forward], minlength=n),
+    }
+    columns = {name: pd.array(count, dtype="Int64") for name, count in counts.items()}
+    vehicles = pd.array([pd.NA] * n, dtype="Int64")
+    if "vehicle_id" in fleet.traces:
+        vehicle = pd.factorize(fleet.traces["vehicle_id"].to_numpy()[fleet.starts[:-1]])[0]
+        vehicles = pd.array(distinct(vehicle[trace].astype(np.int64)), dtype="Int64")
+    return {**columns, "vehicle_support": vehicles}
+
+
+def _oneway(edges: pd.DataFrame, options: EvidenceOptions) -> dict[str, Any]:
+    """Decide the direction of every edge, in the words of OpenStreetMap; what is there already stays."""
+    forward, backward = (edges[name].to_numpy(np.float64) for name in ("forward", "backward"))
+    probability = oneway_probabilities(forward, backward, options=options)
+    best = probability.argmax(axis=1)
+    confidence = probability.max(axis=1)
+    decided = pd.Series(np.array(_TURNED)[best], index=edges.index, dtype="str")
+    decided = decided.mask((confidence < options.min_confidence) | (forward + backward == 0))
+    if "oneway" in edges:
+        text = edges["oneway"].astype("str").str.lower()
+        words = {"yes": 0, "true": 0, "1": 0, "1.0": 0, "-1": 1, "-1.0": 1, "reverse": 1, "no": 2, "false": 2, "0": 2}
+        there = text.map(words)
+        given = there.notna().to_numpy()
+        best = np.where(given, there.fillna(0).to_numpy(np.int64), best)
+        decided = decided.mask(given, pd.Series(np.array(_TURNED)[best], index=edges.index))
+        confidence = probability[np.arange(len(edges)), best]
+    nobody = forward + backward == 0
+    return {"oneway": decided.astype("str"), "oneway_confidence": np.where(nobody, np.nan, confidence)}
+
+
+def _speeds(
+    graph: RoadGraph, fleet: Fleet, driven: Traversals, fixes: FramedFixes, longest: float
+) -> NDArray[np.float64]:
+    """Metres driven by seconds spent on every edge, from fixes that follow each other on it; shape (E,), m/s.
+
+    Edges with no two such fixes take the mean of the column ``speed`` of their fixes.
+    """
+    n = len(graph.edges)
+    edge = driven.edge[fixes.traversal]
+    clock = fleet.traces["t"].to_numpy("datetime64[ns]")[fixes.row]
+    seconds = np.diff(clock, prepend=clock[:1]) / np.timedelta64(1, "s")
+    metres = np.diff(fixes.along, prepend=fixes.along[:1]) * np.where(driven.forward[fixes.traversal], 1.0, -1.0)
+    same = np.diff(fixes.traversal, prepend=-1) == 0
+    used = same & (seconds > 0) & (seconds <= longest)
+    spent = np.bincount(edge[used], seconds[used], n)
+    covered = np.bincount(edge[used], metres[used], n)
+    speed = np.divide(covered, spent, out=np.full(n, np.nan), where=(spent > 0) & (covered > 0))
+    if "speed" in fleet.traces:
+        told = fleet.traces["speed"].to_numpy(np.float64)[fixes.row]
+        told_edge, told = edge[np.isfinite(told)], told[np.isfinite(told)]
+        count = np.bincount(told_edge, minlength=n)
+        mean = np.divide(np.bincount(told_edge, told, n), count, out=np.full(n, np.nan), where=count > 0)
+        speed = np.where(np.isfinite(speed), speed, mean)
+    return speed

@@ -1,0 +1,278 @@
+"""Gap filling: connect dead ends to what they were probably cut off from, and let the traces decide what stays.
+
+Strategy
+--------
+Each dead end proposes at most three links (`probe2road.refinement.gaps.links`). Those that cross an edge are dropped.
+What is left is taken from the shortest link to the longest, as long as it does not repeat one that was taken.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import fields, replace
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+
+from probe2road.errors import OptionError
+from probe2road.graph.clean import drop_edges, merge_degree_two_nodes
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.graph.splitting import split_edges
+from probe2road.graph.tables import finish_edges
+from probe2road.refinement.gaps.jumps import jumped_gaps
+from probe2road.refinement.gaps.links import (
+    NO_NODE,
+    DeadEnds,
+    GapOptions,
+    Links,
+    crosses,
+    dead_ends,
+    straight_on,
+    to_dead_ends,
+    to_edges_beside,
+    within_reach,
+)
+from probe2road.refinement.gaps.stems import facing_stems
+from probe2road.refinement.undriven import traces_per_edge
+
+__all__ = ["GapOptions", "fill_gaps", "fill_jumps", "gap_weights", "prune_gaps"]
+
+logger = logging.getLogger(__name__)
+
+_NEW_NODE = 5.0  # m; links that hit an edge within this of each other share a node
+
+
+def fill_gaps(graph: RoadGraph, *, options: GapOptions | None = None) -> RoadGraph:
+    """Add edges of origin ``gap`` where roads seem to be interrupted.
+
+    From every dead end, links may lead to
+
+    1. the nearest dead end for which the turn is not sharper than ``max_turn`` at either end; turns count like detours,
+       so that the ends of two interrupted roads that cross are joined across;
+    2. what its straight extension hits first: a node where one is within ``snap`` of the hit, else the edge, which is
+       split there;
+    3. the nearest edge within ``beside`` that runs along it, as a mainline beside the end of its ramp, joined a
+       little ahead. The paper does not have this rule; ``beside=0`` switches it off.
+    4. Junctions are joined where roads that end in them face each other (`probe2road.refinement.gaps.stems`), as where
+    the piece
+       between two carriageways is lost. The paper does not have this rule; ``stem_turn=0`` switches it off.
+
+    No link is longer than ``max_length`` or crosses an edge, links at one node differ by ``min_angle`` or more, and no
+    node gets more than ``max_links``. The result does not depend on the order of the edges. A graph without gaps to
+    fill is returned as it is.
+
+    Parameters
+    ----------
+    graph
+        Any road graph.
+    options
+        The defaults where it is None.
+
+    Returns
+    -------
+    RoadGraph
+        Edges keep their ids; a split edge keeps its on the first part. Its parts share its attributes.
+
+    Notes
+    -----
+    Paper, section III-B; METHOD 3.6 and 0.1 rows 16 to 18. Links are proposals: match traces with `gap_weights`, then
+    call `prune_gaps`.
+
+    Examples
+    --------
+    >>> from probe2road.graph.roadgraph import graph_from_lines
+    >>> lines = [[(0, 0), (100, 0)], [(130, 0), (200, 0)], [(50, -90), (50, -20)]]
+    >>> filled = fill_gaps(graph_from_lines(lines, crs="EPSG:32616"))
+    >>> for line in filled.edges.geometry[filled.edges["origin"] == "gap"]:
+    ...     print(line)
+    LINESTRING (50 -20, 50 0)
+    LINESTRING (100 0, 130 0)
+    """
+    options = options or GapOptions()
+    if not len(graph.edges):
+        return graph
+    lines = shapely.force_2d(graph.edges.geometry.to_numpy())
+    ends = dead_ends(graph, lines, options.heading_length)
+    tree = shapely.STRtree(lines)
+    proposed = [
+        to_dead_ends(ends, options),
+        straight_on(graph, lines, tree, ends, options),
+        to_edges_beside(graph, lines, tree, ends, options),
+    ]
+    links = Links(*(np.concatenate([getattr(part, field.name) for part in proposed]) for field in fields(Links)))
+    links = within_reach(ends, links, options)
+    links = links.where(~crosses(graph, tree, ends, links))
+    links = _chosen(ends, links, options)
+    logger.info("added %d gap edges from %d dead ends", len(links.end), len(ends.edge))
+    filled = _with_links(graph, ends, links) if len(links.end) else graph
+    stems = facing_stems(filled, options)
+    logger.info("added %d gap edges between junctions", len(stems))
+    return _with_edges(filled, *filled.nodes.index.to_numpy()[stems.T]) if len(stems) else filled
+
+
+def fill_jumps(graph: RoadGraph, steps: pd.DataFrame, *, options: GapOptions | None = None) -> RoadGraph:
+    """Add edges of origin ``gap`` where traces leave the graph and return to it.
+
+    The paper does not have this rule. Edge ends up to ``max_jump`` apart are joined if ``min_jumps`` traces or more
+    jump from one to the other, and if the turns at both ends are at most ``jump_turn``. A link may cross edges: so it
+    is where a road is lost between the others that it passes over.
+
+    Parameters
+    ----------
+    graph
+        Any road graph.
+    steps
+        Matched paths on it: `probe2road.mapmatch.Matches.steps`.
+    options
+        The defaults where it is None.
+
+    Returns
+    -------
+    RoadGraph
+        The same object where there is nothing to add. As with `fill_gaps`, links are proposals.
+
+    Examples
+    --------
+    >>> from probe2road.graph.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(160, 0), (300, 0)]], crs="EPSG:32616")
+    >>> steps = pd.DataFrame({"trace_id": [1, 1, 2, 2], "edge": [0, 1, 0, 1], "forward": True})
+    >>> print(fill_jumps(graph, steps.assign(entered=False, left=False)).edges.geometry.iloc[2])
+    LINESTRING (100 0, 160 0)
+    """
+    pairs = jumped_gaps(graph, steps, options or GapOptions())
+    logger.info("added %d gap edges where traces jump", len(pairs))
+    return _with_edges(graph, *graph.nodes.index.to_numpy()[pairs.T]) if len(pairs) else graph
+
+
+def gap_weights(graph: RoadGraph, *, gap: float = 0.1) -> pd.Series:
+    """Return the weight of every edge for map matching: 1, and ``gap`` for gap edges.
+
+    Raises
+    ------
+    OptionError
+        If the weight is not above 0 and at most 1.
+
+    Notes
+    -----
+    The alphas of the paper's equation 1; METHOD 0.1 row 19.
+
+    Examples
+    --------
+    >>> from probe2road.graph.roadgraph import graph_from_lines
+    >>> graph = fill_gaps(graph_from_lines([[(0, 0), (100, 0)], [(130, 0), (200, 0)]], crs="EPSG:32616"))
+    >>> gap_weights(graph).tolist()
+    [1.0, 1.0, 0.1]
+    """
+    if not 0 < gap <= 1:
+        raise OptionError(f"gap is {gap}", where="gap_weights", fix="use a number above 0 and at most 1")
+    is_gap = graph.edges["origin"].to_numpy() == "gap"
+    return pd.Series(np.where(is_gap, gap, 1.0), index=graph.edges.index, name="weight")
+
+
+def prune_gaps(graph: RoadGraph, steps: pd.DataFrame, *, min_traces: int = 4) -> RoadGraph:
+    """Remove gap edges that too few traces drove through, and merge what they had split.
+
+    Parameters
+    ----------
+    graph
+        Result of `fill_gaps`.
+    steps
+        Matched paths on that graph: `probe2road.mapmatch.Matches.steps`.
+    min_traces
+        Distinct traces that must enter a gap edge at one end and leave it at the other.
+
+    Returns
+    -------
+    RoadGraph
+        Attributes and turns as for `probe2road.graph.clean.merge_degree_two_nodes`; turns on removed edges are dropped.
+
+    Raises
+    ------
+    OptionError
+        If ``min_traces`` is negative.
+
+    Notes
+    -----
+    METHOD 0.1 row 22.
+
+    Examples
+    --------
+    >>> from probe2road.graph.roadgraph import graph_from_lines
+    >>> graph = fill_gaps(graph_from_lines([[(0, 0), (100, 0)], [(50, -90), (50, -20)]], crs="EPSG:32616"))
+    >>> nobody = pd.DataFrame({"trace_id": [], "edge": [], "entered": [], "left": []})
+    >>> len(graph.edges), len(prune_gaps(graph, nobody).edges)
+    (4, 2)
+    """
+    if min_traces < 0:
+        raise OptionError(f"min_traces is {min_traces}", where="prune_gaps", fix="use a number that is not negative")
+    through = steps[steps["entered"].astype(bool) & steps["left"].astype(bool)]
+    dropped = (graph.edges["origin"] == "gap").to_numpy() & (traces_per_edge(graph, through) < min_traces)
+    why = f"of origin gap with fewer than {min_traces} traces"
+    return merge_degree_two_nodes(drop_edges(graph, dropped, why=why))
+
+
+def _chosen(ends: DeadEnds, links: Links, options: GapOptions) -> Links:
+    """Choose links from the shortest on, none like another at its node and not too many at a node."""
+    vector = links.target - ends.position[links.end]
+    order = np.lexsort([*links.target.T, *ends.position[links.end].T, np.hypot(*vector.T).round(6)])
+    at: dict[tuple[str, int, int], list[float]] = {}
+    taken: list[int] = []
+    for link in order:
+        bearing = float(np.degrees(np.arctan2(vector[link, 1], vector[link, 0])))
+        away, towards = ("node", int(ends.node[links.end[link]]), 0), ("node", int(links.node[link]), 0)
+        if links.node[link] == NO_NODE:
+            towards = ("edge", int(links.edge[link]), round(links.along[link] / _NEW_NODE))
+        here, there = at.setdefault(away, []), at.setdefault(towards, [])
+        if _has_room(here, bearing, options) and _has_room(there, bearing + 180.0, options):
+            here.append(bearing)
+            there.append(bearing + 180.0)
+            taken.append(int(link))
+    return links.where(np.array(taken, np.int64))
+
+
+def _has_room(bearings: list[float], bearing: float, options: GapOptions) -> bool:
+    """Tell whether a node with links at some bearings (degrees) takes one more."""
+    near = any(abs((other - bearing + 180.0) % 360.0 - 180.0) < options.min_angle for other in bearings)
+    return not near and len(bearings) < options.max_links
+
+
+def _with_links(graph: RoadGraph, ends: DeadEnds, links: Links) -> RoadGraph:
+    """Split edges where links lead into them, and add the links as edges."""
+    into = links.node == NO_NODE
+    edge_ids = graph.edges.index.to_numpy()
+    graph, made = split_edges(graph, edge_ids[links.edge[into]], links.along[into], merge=_NEW_NODE)
+    names = graph.nodes.index.to_numpy()  # the old nodes come first, in their order
+    u = names[ends.node[links.end]]
+    v = names[links.node]
+    v[into] = made
+    return _with_edges(graph, u, v)
+
+
+def _with_edges(graph: RoadGraph, u: NDArray[np.int64], v: NDArray[np.int64]) -> RoadGraph:
+    """Add straight edges of origin ``gap`` between nodes."""
+    lines = _straight_lines(graph, u, v)
+    first = int(graph.edges.index.max()) + 1
+    new = gpd.GeoDataFrame(
+        {"u": u, "v": v, "origin": "gap"},
+        geometry=lines,
+        index=np.arange(first, first + len(u)),
+        crs=graph.crs,
+    )
+    edges = pd.concat([graph.edges, finish_edges(new)])
+    return replace(graph, edges=finish_edges(edges))
+
+
+def _straight_lines(graph: RoadGraph, u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.object_]:
+    """Draw lines between nodes, with the heights that edges have there where edges have heights."""
+    edges = graph.edges
+    lines = edges.geometry.to_numpy()
+    if shapely.has_z(lines).any():
+        ends = shapely.get_point(np.stack([lines, lines]), np.array([[0], [-1]])).ravel()
+        of_node = pd.Series(ends, index=np.concatenate([edges["u"], edges["v"]])).groupby(level=0).first()
+    else:
+        of_node = graph.nodes.geometry
+    xyz = [shapely.get_coordinates(of_node[node].to_numpy(), include_z=shapely.has_z(lines).any()) for node in (u, v)]
+    return np.asarray(shapely.linestrings(np.stack(xyz, axis=1)))

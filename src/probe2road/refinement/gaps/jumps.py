@@ -1,0 +1,73 @@
+"""Roads interrupted where traces go on: pairs of edge ends between which traces jump.
+
+Where a road passes over or under several others its mask is often lost for longer than geometry alone may bridge, and
+its ends have grown into the roads it crosses. Matched traces show that: they leave the graph at one edge end and are
+back at another, some metres ahead. Such a link may cross other roads, which is what the road does.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.refinement.gaps.links import GapOptions, angle_between, ends_of_lines
+
+__all__ = ["jumped_gaps"]
+
+
+def jumped_gaps(graph: RoadGraph, steps: pd.DataFrame, options: GapOptions) -> NDArray[np.int64]:
+    """List the pairs of nodes between which traces are not on the graph.
+
+    Parameters
+    ----------
+    graph
+        Any road graph.
+    steps
+        Paths matched on it: `probe2road.mapmatch.Matches.steps`.
+    options
+        Of which ``max_jump``, ``min_jumps``, ``jump_turn`` and ``heading_length`` are used.
+
+    Returns
+    -------
+    ndarray of int64, shape (n, 2)
+        Rows of nodes, the smaller first; pairs that an edge joins are left out.
+
+    Examples
+    --------
+    Two drives are lost for 60 m:
+
+    >>> from probe2road.graph.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(160, 0), (300, 0)]], crs="EPSG:32616")
+    >>> steps = pd.DataFrame({"trace_id": [1, 1, 2, 2], "edge": [0, 1, 0, 1], "forward": True})
+    >>> jumped_gaps(graph, steps.assign(entered=False, left=False), GapOptions())
+    array([[1, 2]])
+    """
+    trace, forward = steps["trace_id"].to_numpy(), steps["forward"].to_numpy(bool)
+    edge = graph.edges.index.get_indexer(steps["edge"])
+    entered, left = (steps[name].to_numpy(bool) for name in ("entered", "left"))
+    off = np.flatnonzero((trace[1:] == trace[:-1]) & ~left[:-1] & ~entered[1:])
+    reach = options.heading_length
+    node, position, ahead = _ends(graph, edge[off], at_start=~forward[off], reach=reach)
+    other, there, back = _ends(graph, edge[off + 1], at_start=forward[off + 1], reach=reach)
+    link = there - position
+    distance = np.hypot(*link.T)
+    turn = np.maximum(angle_between(ahead, link), angle_between(-back, link))
+    fits = (node != other) & (distance > 0) & (distance <= options.max_jump) & (turn <= options.jump_turn)
+    pairs = np.sort(np.stack([node, other], axis=1)[fits], axis=1)
+    jumps = pd.DataFrame({"one": pairs[:, 0], "other": pairs[:, 1], "trace": trace[off[fits]]})
+    traces = jumps.groupby(["one", "other"])["trace"].nunique()
+    joined = np.sort(graph.nodes.index.get_indexer(graph.edges[["u", "v"]].to_numpy().ravel()).reshape(-1, 2), axis=1)
+    found = traces.index[(traces >= options.min_jumps) & ~traces.index.isin(pd.MultiIndex.from_arrays(joined.T))]
+    return np.array(found.to_list(), np.int64).reshape(-1, 2)
+
+
+def _ends(
+    graph: RoadGraph, edge: NDArray[np.int64], *, at_start: NDArray[np.bool_], reach: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Look up ends by rows of edges: rows of their nodes ``(n,)``, positions and directions (m) ``(n, 2)``."""
+    node = np.where(at_start, *(graph.edges[end].to_numpy()[edge] for end in ("u", "v")))
+    lines = shapely.force_2d(graph.edges.geometry.to_numpy()[edge])
+    return graph.nodes.index.get_indexer(node).astype(np.int64), *ends_of_lines(lines, at_start, reach)

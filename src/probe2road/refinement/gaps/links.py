@@ -1,0 +1,287 @@
+"""Links across gaps: what a dead end may have been cut off from.
+
+Strategy
+--------
+All dead ends are looked at together and on the graph as it came. A link is a row: the dead end it starts from, and a
+target, which is a node or a place on an edge. Ties are broken by coordinates, so the order of the edges plays no part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from probe2road.errors import OptionError
+from probe2road.graph.roadgraph import RoadGraph
+
+__all__ = [
+    "NO_NODE",
+    "DeadEnds",
+    "GapOptions",
+    "Links",
+    "angle_between",
+    "crosses",
+    "dead_ends",
+    "ends_of_lines",
+    "straight_on",
+    "to_dead_ends",
+    "to_edges_beside",
+    "within_reach",
+]
+
+NO_NODE = -1  # node of a link that leads into an edge
+
+_ALONG = 45.0  # degrees; an edge beside a dead end runs along it when the two directions differ by less
+_TURN = 45.0  # degrees that count like the distance once more
+_LEAD = 2.0  # times the distance aside, by which a link to an edge beside leads ahead: it leaves by about 27 degrees
+_TOUCH = 0.05  # m; a link is not tested for crossings nearer than this to its ends
+
+
+@dataclass(frozen=True)
+class GapOptions:
+    """Which gaps are filled (METHOD 3.6, 0.1 rows 16 to 18)."""
+
+    max_length: float = 50.0  # m; longer links are never made
+    snap: float = 15.0  # m; a hit this near to the end of its edge goes to the node there
+    beside: float = 20.0  # m; a dead end is led into an edge that runs along it this near; 0 switches that off
+    max_turn: float = 90.0  # degrees, between road and link, at both ends of a link between dead ends
+    min_angle: float = 20.0  # degrees; of two links at one node that differ by less, the shorter is made
+    heading_length: float = 15.0  # m, over which the direction of a dead end is measured
+    max_links: int = 2  # links at one node
+    stem_turn: float = 20.0  # degrees, at both ends of a link between junctions that face each other; 0: no such links
+    max_jump: float = 100.0  # m, between edge ends that are joined because traces jump from one to the other; 0: none
+    min_jumps: int = 2  # traces that must
+    jump_turn: float = 60.0  # degrees, between road and link, at both of its ends
+
+    def __post_init__(self) -> None:
+        """Refuse negative numbers."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not value >= 0:
+                fix = "use a number that is not negative"
+                raise OptionError(f"{field.name} is {value}", where="GapOptions", fix=fix)
+        if not self.heading_length > 0:
+            raise OptionError("heading_length is 0", where="GapOptions", fix="use a positive number")
+
+
+@dataclass(frozen=True)
+class DeadEnds:
+    """n dead ends."""
+
+    edge: NDArray[np.int64]  # (n,) row of the edge
+    node: NDArray[np.int64]  # (n,) row of the node
+    at_start: NDArray[np.bool_]  # (n,) whether the edge starts here
+    position: NDArray[np.float64]  # (n, 2) m
+    ahead: NDArray[np.float64]  # (n, 2) unit vector out of the road
+
+
+@dataclass(frozen=True)
+class Links:
+    """n links from dead ends."""
+
+    end: NDArray[np.int64]  # (n,) row of the dead end
+    node: NDArray[np.int64]  # (n,) row of the node it leads to, NO_NODE where it leads into an edge
+    edge: NDArray[np.int64]  # (n,) row of the edge it leads to, also where it was snapped to one of its nodes
+    along: NDArray[np.float64]  # (n,) m from the start of that edge
+    target: NDArray[np.float64]  # (n, 2) m
+
+    def where(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> Links:
+        """Return some of the links."""
+        return Links(*(getattr(self, field.name)[kept] for field in fields(self)))
+
+
+def ends_of_lines(
+    lines: NDArray[np.object_], at_start: NDArray[np.bool_], reach: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return one end of each line and the vector that leads there from within, over a length or all of it.
+
+    Parameters
+    ----------
+    lines
+        In plan, shape ``(n,)``.
+    at_start
+        Which end, shape ``(n,)``.
+    reach
+        The length, m.
+
+    Returns
+    -------
+    position, ahead
+        Metres, shape ``(n, 2)`` each; a vector is zero where its line comes back to its end.
+    """
+    length = shapely.length(lines)
+    tip = np.where(at_start, 0.0, length)
+    inner = np.where(at_start, np.minimum(reach, length), np.maximum(length - reach, 0.0))
+    position, inside = (shapely.get_coordinates(shapely.line_interpolate_point(lines, along)) for along in (tip, inner))
+    return position, position - inside
+
+
+def dead_ends(graph: RoadGraph, lines: NDArray[np.object_], reach: float) -> DeadEnds:
+    """Collect the ends of edges at nodes of degree 1."""
+    row = pd.Series(np.arange(len(graph.nodes)), index=graph.nodes.index)
+    node = np.stack([row[graph.edges[end]].to_numpy() for end in ("u", "v")])
+    degree = np.bincount(node.ravel(), minlength=len(graph.nodes))
+    side, edge = np.nonzero(degree[node] == 1)
+    at_start = side == 0
+    position, ahead = ends_of_lines(lines[edge], at_start, reach)
+    # An edge that curls back onto its end within the reach has no direction; it is left out.
+    norm = np.hypot(*ahead.T)
+    kept = norm > 0
+    ahead = ahead[kept] / norm[kept, None]
+    return DeadEnds(edge[kept], node[side, edge][kept], at_start[kept], position[kept], ahead)
+
+
+def to_dead_ends(ends: DeadEnds, options: GapOptions) -> Links:
+    """Link every dead end to the nearest one that lies ahead of it and that it lies ahead of.
+
+    A turn counts like a detour, each 45 degrees like the distance once more: where two interrupted roads cross, their
+    four ends are joined across and not around the corner.
+    """
+    pairs = KDTree(ends.position).query_pairs(options.max_length, output_type="ndarray") if len(ends.edge) else []
+    one, other = np.concatenate([pairs, np.flip(pairs, 1)]).T if len(pairs) else np.zeros((2, 0), np.int64)
+    vector = ends.position[other] - ends.position[one]
+    turns = np.stack([angle_between(ends.ahead[one], vector), angle_between(-ends.ahead[other], vector)])
+    distance = np.hypot(*vector.T) * (1.0 + turns.sum(axis=0) / _TURN)
+    fits = (turns.max(axis=0) <= options.max_turn) & (distance > 0)
+    one, other, distance = one[fits], other[fits], distance[fits]
+    order = np.lexsort([*ends.position[other].T, distance.round(6), one])
+    nearest = order[_heads(one[order])]
+    one, other = one[nearest], other[nearest]
+    unknown = np.full(len(one), -1)
+    return Links(one, ends.node[other], unknown, np.full(len(one), np.nan), ends.position[other])
+
+
+def straight_on(
+    graph: RoadGraph, lines: NDArray[np.object_], tree: shapely.STRtree, ends: DeadEnds, options: GapOptions
+) -> Links:
+    """Link every dead end to what its straight extension hits first."""
+    far = ends.position + options.max_length * ends.ahead
+    rays = shapely.linestrings(np.stack([ends.position, far], axis=1))
+    end, edge = tree.query(rays, predicate="intersects")
+    hits = shapely.intersection(rays[end], lines[edge])
+    places, pair = shapely.get_coordinates(hits, return_index=True)  # of a stretch in common, both ends
+    end, edge = end[pair], edge[pair]
+    distance = ((places - ends.position[end]) * ends.ahead[end]).sum(axis=1)
+    along = shapely.line_locate_point(lines[edge], shapely.points(places))
+    kept = (distance > _TOUCH) & _apart_on_edge(lines, ends, end, edge, along, options.max_length)
+    order = np.flatnonzero(kept)
+    order = order[np.lexsort([along[order], distance[order], end[order]])]
+    first = order[_heads(end[order])]
+    return _snapped(graph, lines, end[first], edge[first], along[first], options.snap)
+
+
+def to_edges_beside(
+    graph: RoadGraph, lines: NDArray[np.object_], tree: shapely.STRtree, ends: DeadEnds, options: GapOptions
+) -> Links:
+    """Link every dead end to the nearest edge that runs along it, ahead by twice the distance between them.
+
+    A ramp's end is nearly parallel to the mainline. Its straight extension would reach it far ahead, or never.
+    """
+    end, edge = tree.query(shapely.points(ends.position), predicate="dwithin", distance=options.beside)
+    nearest = shapely.line_interpolate_point(
+        lines[edge], shapely.line_locate_point(lines[edge], shapely.points(ends.position[end]))
+    )
+    to_edge = shapely.get_coordinates(nearest).reshape(-1, 2) - ends.position[end]
+    aside = np.hypot(*to_edge.T)
+    ahead = shapely.points(ends.position[end] + _LEAD * aside[:, None] * ends.ahead[end])
+    along = shapely.line_locate_point(lines[edge], ahead)
+    target = shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], along))
+    slope = angle_between(ends.ahead[end], _directions(lines[edge], along))
+    kept = (
+        (aside > _TOUCH)
+        & (angle_between(ends.ahead[end], to_edge) >= _ALONG)  # else it is ahead, not beside
+        & (np.minimum(slope, 180.0 - slope) <= _ALONG)
+        & (angle_between(ends.ahead[end], target - ends.position[end]) <= _ALONG)
+        & _apart_on_edge(lines, ends, end, edge, along, options.max_length)
+    )
+    order = np.flatnonzero(kept)
+    order = order[np.lexsort([*target[order].T, aside[order], end[order]])]
+    nearest = order[_heads(end[order])]
+    return _snapped(graph, lines, end[nearest], edge[nearest], along[nearest], options.snap)
+
+
+def _apart_on_edge(
+    lines: NDArray[np.object_],
+    ends: DeadEnds,
+    end: NDArray[np.int64],
+    edge: NDArray[np.int64],
+    along: NDArray[np.float64],
+    least: float,
+) -> NDArray[np.bool_]:
+    """Tell which places are on another edge than the dead end itself, or far from it along its own."""
+    own = ends.edge[end] == edge
+    from_end = np.where(ends.at_start[end], along, shapely.length(lines[edge]) - along)
+    return np.asarray(~own | (from_end > 2 * least))
+
+
+def _snapped(
+    graph: RoadGraph,
+    lines: NDArray[np.object_],
+    end: NDArray[np.int64],
+    edge: NDArray[np.int64],
+    along: NDArray[np.float64],
+    snap: float,
+) -> Links:
+    """Lead links to places on edges, or to the nearer end node of an edge within ``snap``."""
+    length = shapely.length(lines[edge])
+    at_start = along <= length - along
+    snapped = np.minimum(along, length - along) <= snap
+    name = graph.edges[["u", "v"]].to_numpy()[edge, np.where(at_start, 0, 1)]
+    node = np.where(snapped, graph.nodes.index.get_indexer(name), NO_NODE)
+    along = np.where(snapped, np.where(at_start, 0.0, length), along)
+    target = shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], along)).reshape(-1, 2)
+    return Links(end, node, edge, along, target)
+
+
+def within_reach(ends: DeadEnds, links: Links, options: GapOptions) -> Links:
+    """Drop links that are too long, turn too sharply, or lead nowhere."""
+    vector = links.target - ends.position[links.end]
+    length = np.hypot(*vector.T)
+    turn = angle_between(ends.ahead[links.end], vector)
+    # A link into a dead end turns there too, by whatever rule it came about.
+    of_node = pd.Series(np.arange(len(ends.node)), index=ends.node).groupby(level=0).first()
+    other = of_node.reindex(links.node).to_numpy(np.float64)
+    into = np.isfinite(other)
+    turn[into] = np.maximum(turn[into], angle_between(-ends.ahead[other[into].astype(np.int64)], vector[into]))
+    elsewhere = (links.node != ends.node[links.end]) & (length > 0)
+    return links.where(elsewhere & (length <= options.max_length) & (turn <= options.max_turn))
+
+
+def crosses(graph: RoadGraph, tree: shapely.STRtree, ends: DeadEnds, links: Links) -> NDArray[np.bool_]:
+    """Tell which links meet an edge between their ends; edges at the node that they lead to are not asked."""
+    start = ends.position[links.end]
+    vector = links.target - start
+    length = np.maximum(np.hypot(*vector.T), 2 * _TOUCH)[:, None]
+    body = shapely.linestrings(
+        np.stack([start + vector * (_TOUCH / length), links.target - vector * (_TOUCH / length)], axis=1)
+    )
+    link, edge = tree.query(body, predicate="intersects")
+    name = graph.nodes.index.to_numpy()
+    at_target = (graph.edges[["u", "v"]].to_numpy()[edge] == name[links.node[link]][:, None]).any(axis=1)
+    asked = ~(at_target & (links.node[link] != NO_NODE)) & ~((links.node[link] == NO_NODE) & (links.edge[link] == edge))
+    crosses = np.zeros(len(links.end), bool)
+    crosses[link[asked]] = True
+    return crosses
+
+
+def _directions(lines: NDArray[np.object_], along: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return vectors along lines, over 2 m around places on them, shape (n, 2)."""
+    before = shapely.line_interpolate_point(lines, np.maximum(along - 1.0, 0.0))
+    after = shapely.line_interpolate_point(lines, np.minimum(along + 1.0, shapely.length(lines)))
+    return np.asarray(shapely.get_coordinates(after) - shapely.get_coordinates(before))
+
+
+def angle_between(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angle between vectors of shape (n, 2), degrees from 0 to 180."""
+    cross = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
+    return np.asarray(np.degrees(np.arctan2(np.abs(cross), (one * other).sum(axis=1))))
+
+
+def _heads(group: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Mark the first row of every group in a sorted array."""
+    return np.diff(group, prepend=-1) != 0

@@ -1,0 +1,51 @@
+"""The whole refinement, on graphs as masks give them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.graph.check import check_graph
+from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.refinement.gaps.fill import GapOptions
+from probe2road.refinement.recipe import RefineOptions, refine_graph
+
+CRS = "EPSG:32616"
+# A road on a bridge over two others, whose mask is lost between them and has grown into both.
+LOST = [
+    [(-200, 0), (100, 0)], [(180, 0), (500, 0)],
+    [(100, -300), (100, 0)], [(100, 0), (100, 300)], [(180, -300), (180, 0)], [(180, 0), (180, 300)],
+]  # fmt: skip
+
+
+def drives(n: int = 6) -> Fleet:
+    """Drives on the bridge, and on both roads under it."""
+    along = np.arange(-290.0, 290.0, 10.0)
+    roads = [(200.0 + along, 0.0 * along, 8.0), (100.0 + 0.0 * along, along, 0.0), (180.0 + 0.0 * along, along, 0.0)]
+    tables = [
+        pd.DataFrame({"trace_id": n * road + k, "t": np.arange(len(x)), "x": x, "y": y, "z": z})
+        for road, (x, y, z) in enumerate(roads)
+        for k in range(n)
+    ]
+    return fleet_from_tables(pd.concat(tables), crs=CRS, target_crs=CRS)
+
+
+def refined(graph: RoadGraph, **gaps: float) -> RoadGraph:
+    result = refine_graph(graph, drives(), RefineOptions(gaps=GapOptions(**gaps)))
+    check_graph(result)
+    return result
+
+
+def test_a_bridge_that_the_mask_lost_becomes_one_road_over_the_others() -> None:
+    graph = refined(graph_from_lines(LOST, crs=CRS))
+    assert sorted(graph.edges["length"].round()) == [600.0, 600.0, 700.0]
+    assert graph.degrees().tolist() == [1] * 6
+    assert (graph.edges["support"] == 6).all()
+
+
+@pytest.mark.parametrize("gaps", [{"max_jump": 70.0}, {"min_jumps": 7}])
+def test_without_proof_it_stays_in_pieces(gaps: dict[str, float]) -> None:
+    graph = refined(graph_from_lines(LOST, crs=CRS), **gaps)
+    assert sorted(graph.edges["length"].round())[-1] < 700.0
