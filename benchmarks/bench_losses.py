@@ -20,7 +20,7 @@ from skimage.morphology import skeletonize as zhang_of_skimage
 from probe2road.segmentation.connectivity import connectivity_weights, dilate, distances, wrong_skeletons
 from probe2road.segmentation.dlinknet import DLinkNet, find_architecture
 from probe2road.segmentation.losses import LossOptions, loss_function
-from probe2road.skeleton import skeletonize
+from probe2road.vectorize.skeleton import skeletonize
 
 SIZES = (512, 1000)  # px
 BATCHES = (2, 4)  # images

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
-from probe2road.mapmatch import MatchOptions, match
+from probe2road.matching.match import MatchOptions, match
 
 SPEED = 12.0  # m/s
 DURATION = 1800  # s

@@ -14,7 +14,7 @@ import pandas as pd
 from probe2road.crs import parse_crs
 from probe2road.fleet import Fleet, trace_breaks
 from probe2road.fleet_tables import POINT_KINDS
-from probe2road.raster import fleet_grid, rasterize
+from probe2road.raster.counts import fleet_grid, rasterize
 
 FIXES_PER_DRIVE = 500
 STEP = 20.0  # m

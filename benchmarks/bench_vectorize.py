@@ -18,10 +18,10 @@ from rasterio.features import rasterize
 from scipy.ndimage import binary_dilation
 
 from probe2road.graph.clean import clean_graph
-from probe2road.raster import Grid
-from probe2road.skeleton import Method, skeleton_pixels, skeletonize, skeletonize_windows
-from probe2road.tracing import trace_pixels
-from probe2road.vectorize import vectorize
+from probe2road.raster.counts import Grid
+from probe2road.vectorize.lines import vectorize
+from probe2road.vectorize.skeleton import Method, skeleton_pixels, skeletonize, skeletonize_windows
+from probe2road.vectorize.tracing import trace_pixels
 
 METHODS: tuple[Method, ...] = ("guo_hall", "zhang_suen")
 WIDTHS = (3, 5, 9, 13)  # px

@@ -21,10 +21,10 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road import build, evaluate, read_fleet, read_graph
-from probe2road.edge_frame import edge_lines, stations_along
 from probe2road.fleet import Fleet
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.mapmatch import match
+from probe2road.matching.frame import edge_lines, stations_along
+from probe2road.matching.match import match
 from probe2road.recipe import BuildOptions
 from probe2road.refinement.centreline import CentrelineOptions, refine_centreline
 from probe2road.refinement.recipe import RefineOptions

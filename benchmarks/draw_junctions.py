@@ -17,7 +17,7 @@ import shapely
 
 from probe2road.graph.clean import clean_graph
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.mapmatch import match
+from probe2road.matching.match import match
 from probe2road.recipe import BuildOptions, build
 from probe2road.refinement.gaps.fill import fill_gaps, gap_weights, prune_gaps
 from probe2road.refinement.junctions.passages import passing_positions

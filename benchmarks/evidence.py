@@ -17,9 +17,9 @@ import numpy as np
 import pandas as pd
 import shapely
 
-from probe2road.edge_frame import edge_lines, stations_along
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.mapmatch import match
+from probe2road.matching.frame import edge_lines, stations_along
+from probe2road.matching.match import match
 from probe2road.refinement.evidence import add_evidence
 from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
 from probe2road.simulate.generate import generate_interchange, generate_town

@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.mapmatch import match
+from probe2road.matching.match import match
 from probe2road.recipe import BuildOptions, build
 from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, gap_weights, prune_gaps
 from probe2road.simulate.fleet_simulation import simulate

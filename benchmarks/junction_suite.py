@@ -26,7 +26,7 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.splitting import split_edges
 from probe2road.graph.tables import finish_edges
 from probe2road.graph.topology import end_nodes
-from probe2road.mapmatch import Matches, match
+from probe2road.matching.match import Matches, match
 from probe2road.recipe import BuildOptions, build
 from probe2road.refinement.gaps.fill import fill_gaps, gap_weights, prune_gaps
 from probe2road.refinement.junctions.passages import passing_positions

@@ -41,7 +41,7 @@ from probe2road.crs import WGS84, local_crs, transform
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import empty_turns, finish_edges
-from probe2road.mapmatch import Matches, MatchOptions, match
+from probe2road.matching.match import Matches, MatchOptions, match
 
 DATA = Path(os.environ.get("PROBE2ROAD_DATA", "../shared/data")) / "mapmatching" / "kubicka"
 INTERVALS = (1, 5, 15, 30, 60)  # s

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from probe2road.errors import MissingExtraError
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.labels import LabelOptions, cut_reference, label_reference
-from probe2road.osrm import find_osrm
+from probe2road.matching.labels import LabelOptions, cut_reference, label_reference
+from probe2road.matching.osrm import find_osrm
 from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
 from probe2road.simulate.generate import generate_interchange
 from probe2road.simulate.network import RoadNetwork

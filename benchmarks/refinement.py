@@ -23,7 +23,7 @@ from probe2road.graph.clean import clean_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path
-from probe2road.mapmatch import match
+from probe2road.matching.match import match
 from probe2road.metrics import evaluate
 from probe2road.picture import draw_graph
 from probe2road.recipe import BuildOptions, build

@@ -26,7 +26,7 @@ from scipy import ndimage
 from torch import Tensor, nn
 from torch.nn import functional
 
-from probe2road.raster import CHANNELS
+from probe2road.raster.counts import CHANNELS
 from probe2road.segmentation.dlinknet import ARCHITECTURES, STRIDE, Architecture, DLinkNet
 from probe2road.segmentation.export_onnx import export
 from probe2road.segmentation.losses import LossOptions, bce_dice, loss_function

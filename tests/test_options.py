@@ -3,7 +3,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from probe2road.errors import OptionError
-from probe2road.mapmatch import MatchOptions
+from probe2road.matching.match import MatchOptions
 from probe2road.options import load_options, options_from_table
 
 

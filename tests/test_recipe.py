@@ -11,8 +11,8 @@ from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.clean import CleanOptions
 from probe2road.graph.roadgraph import graph_from_lines
-from probe2road.grid import read_raster
 from probe2road.metrics import evaluate
+from probe2road.raster.grid import read_raster
 from probe2road.recipe import BuildOptions, build
 from probe2road.segmentation.density import DensityOptions, density_probability
 from probe2road.workspace import fingerprint

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from probe2road.io.fleet_summary import describe_fleet
     from probe2road.io.fleet_writer import write_fleet
     from probe2road.io.graph_networkx import from_networkx, to_networkx
-    from probe2road.labels import label_reference
-    from probe2road.mapmatch import Matches, MatchOptions, match
+    from probe2road.matching.labels import label_reference
+    from probe2road.matching.match import Matches, MatchOptions, match
     from probe2road.metrics.evaluate import evaluate
-    from probe2road.raster import rasterize
+    from probe2road.raster.counts import rasterize
     from probe2road.recipe import BuildOptions, build
     from probe2road.refinement.recipe import refine_graph
     from probe2road.view import write_view
@@ -43,12 +43,12 @@ _HOME = {
     "write_graph": "export",
     "to_networkx": "io.graph_networkx",
     "from_networkx": "io.graph_networkx",
-    "rasterize": "raster",
-    "MatchOptions": "mapmatch",
-    "Matches": "mapmatch",
-    "match": "mapmatch",
+    "rasterize": "raster.counts",
+    "MatchOptions": "matching.match",
+    "Matches": "matching.match",
+    "match": "matching.match",
     "refine_graph": "refinement.recipe",
-    "label_reference": "labels",
+    "label_reference": "matching.labels",
     "BuildOptions": "recipe",
     "build": "recipe",
     "evaluate": "metrics.evaluate",

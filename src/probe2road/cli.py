@@ -189,8 +189,8 @@ def match(
     """Match traces to the edges of a road graph."""
     from probe2road.export import read_graph
     from probe2road.io.atomic import atomic_path
-    from probe2road.mapmatch import MatchOptions
-    from probe2road.mapmatch import match as match_fleet
+    from probe2road.matching.match import MatchOptions
+    from probe2road.matching.match import match as match_fleet
     from probe2road.options import load_options
 
     options = load_options(config, MatchOptions) if config else MatchOptions()

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet import Fleet
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.grid import Grid
 from probe2road.io.atomic import atomic_path
-from probe2road.raster import rasterize
+from probe2road.raster.counts import rasterize
+from probe2road.raster.grid import Grid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,9 +15,9 @@ from probe2road.export import read_graph
 from probe2road.fleet import Fleet, TraceGaps
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.grid import Grid, read_raster, sparse_zeros
 from probe2road.picture import Stage, write_filmstrip
-from probe2road.raster import fleet_grid, rasterize, rasterize_windows
+from probe2road.raster.counts import fleet_grid, rasterize, rasterize_windows
+from probe2road.raster.grid import Grid, read_raster, sparse_zeros
 from probe2road.refinement.recipe import RefineOptions, refine_graph
 from probe2road.segmentation.density import DensityOptions, density_segmenter
 from probe2road.segmentation.mask import threshold_mask
@@ -25,8 +25,8 @@ from probe2road.segmentation.network import NetworkOptions, find_weights, networ
 from probe2road.segmentation.segmenter import Segmenter
 from probe2road.segmentation.tiling import add_window, predict_window
 from probe2road.segmentation.weights import Weights
-from probe2road.skeleton import METHODS, Method, skeletonize_windows
-from probe2road.vectorize import VectorizeOptions, vectorize
+from probe2road.vectorize.lines import VectorizeOptions, vectorize
+from probe2road.vectorize.skeleton import METHODS, Method, skeletonize_windows
 from probe2road.workspace import Progress, Workspace, open_workspace, silent
 
 __all__ = ["SEGMENTERS", "BuildOptions", "Progress", "Segmentation", "build", "draw_stages"]

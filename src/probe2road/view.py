@@ -28,11 +28,11 @@ from probe2road.crs import WGS84, transform
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, TraceGaps
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.grid import Grid
 from probe2road.io.atomic import atomic_path
 from probe2road.io.graph_tables import outgoing
 from probe2road.io.graph_writers import geojson_features
-from probe2road.raster import rasterize
+from probe2road.raster.counts import rasterize
+from probe2road.raster.grid import Grid
 
 __all__ = ["write_view"]
 

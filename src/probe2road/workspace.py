@@ -25,8 +25,8 @@ from probe2road.errors import OutputError
 from probe2road.export import read_graph, write_graph
 from probe2road.fleet import Fleet
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.grid import Grid, read_raster, write_raster
 from probe2road.io.atomic import atomic_path, make_folder
+from probe2road.raster.grid import Grid, read_raster, write_raster
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -17,9 +17,9 @@ from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import graph_from_lines
-from probe2road.grid import Grid
 from probe2road.matching.network import build_states
 from probe2road.matching.published import emission_table, transition
+from probe2road.raster.grid import Grid
 
 CRS = "EPSG:32616"
 MODEL = BiagioniOptions().matcher

@@ -16,7 +16,7 @@ from probe2road.baselines.volume_skeleton import thin_volume
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
-from probe2road.grid import Grid
+from probe2road.raster.grid import Grid
 
 CRS = "EPSG:32616"
 Volume = NDArray[np.bool_]

@@ -15,9 +15,9 @@ from scipy.sparse.csgraph import connected_components
 from probe2road.graph.check import check_graph
 from probe2road.graph.clean import CleanOptions, clean_graph, merge_degree_two_nodes
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
-from probe2road.raster import Grid
-from probe2road.skeleton import skeletonize, skeletonize_windows
-from probe2road.vectorize import VectorizeOptions, vectorize
+from probe2road.raster.counts import Grid
+from probe2road.vectorize.lines import VectorizeOptions, vectorize
+from probe2road.vectorize.skeleton import skeletonize, skeletonize_windows
 
 PIXELS = VectorizeOptions(smoothing=0.0, simplify_tolerance=0.0)
 ONE_STEP = 2**0.5 + 1e-6  # px; from a pixel to its farthest neighbour

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
-from probe2road.mapmatch import Matches, MatchOptions, match
+from probe2road.matching.match import Matches, MatchOptions, match
 
 CRS = "EPSG:32616"
 seeds = st.integers(0, 2**32 - 1)

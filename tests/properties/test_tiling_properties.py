@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from probe2road.grid import Grid
+from probe2road.raster.grid import Grid
 from probe2road.segmentation.segmenter import Segmenter
 from probe2road.segmentation.tiling import add_window, predict_window, raster_windows, segment_raster
 

@@ -15,7 +15,7 @@ from probe2road.errors import CRSError, OptionError
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
-from probe2road.mapmatch import match
+from probe2road.matching.match import match
 from probe2road.refinement.centreline import CentrelineOptions, refine_centreline
 
 CRS = "EPSG:32616"

@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 
 from probe2road.fleet import Fleet, fleet_from_tables
-from probe2road.raster import fleet_grid
+from probe2road.raster.counts import fleet_grid
 from probe2road.segmentation.bandwidth import estimate_bandwidth, lateral_spread
 
 CRS = "EPSG:32616"

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from probe2road.errors import InputError, OptionError
 from probe2road.segmentation.connectivity import connectivity_weights, dilate, distances, proximity, wrong_skeletons
-from probe2road.skeleton import skeletonize
+from probe2road.vectorize.skeleton import skeletonize
 
 masks = arrays(bool, array_shapes(min_dims=2, max_dims=2, max_side=12))
 

@@ -7,8 +7,8 @@ import pytest
 
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet import fleet_from_tables
-from probe2road.grid import Grid
-from probe2road.raster import fleet_grid, rasterize
+from probe2road.raster.counts import fleet_grid, rasterize
+from probe2road.raster.grid import Grid
 from probe2road.recipe import BuildOptions, build
 from probe2road.segmentation.network import NetworkOptions, find_weights, network_segmenter, shipped_weights
 from probe2road.segmentation.tiling import segment_raster

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from probe2road.errors import InputError
-from probe2road.grid import Grid
+from probe2road.raster.grid import Grid
 from probe2road.segmentation.segmenter import Segmenter
 from probe2road.segmentation.tiling import add_window, predict_window, raster_windows, segment_raster
 

@@ -8,11 +8,11 @@ from probe2road.benchmark.reference import labelled_reference
 from probe2road.errors import InputError, OptionError
 from probe2road.export import read_graph
 from probe2road.fleet import fleet_from_tables
-from probe2road.grid import Grid
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path
-from probe2road.labels import label_mask
-from probe2road.raster import rasterize
+from probe2road.raster.counts import rasterize
+from probe2road.raster.grid import Grid
+from probe2road.raster.lines import label_mask
 from probe2road.training.samples import SampleOptions, draw_sample, square
 from probe2road.training.scene import load_scene, make_scene, rows_around, save_scene
 from probe2road.training.sources import Source, open_scene

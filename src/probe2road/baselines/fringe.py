@@ -18,8 +18,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from probe2road.skeleton import skeleton_pixels
-from probe2road.tracing import PixelGraph, pixel_links
+from probe2road.vectorize.skeleton import skeleton_pixels
+from probe2road.vectorize.tracing import PixelGraph, pixel_links
 
 __all__ = ["fringe_branches", "trace_fringe"]
 
@@ -42,7 +42,7 @@ def fringe_branches(skeleton: NDArray[Any]) -> NDArray[np.int64]:
     Returns
     -------
     ndarray of int64
-        One number for each pixel, in the order of `probe2road.skeleton.skeleton_pixels`.
+        One number for each pixel, in the order of `probe2road.vectorize.skeleton.skeleton_pixels`.
 
     Examples
     --------
@@ -59,7 +59,7 @@ def trace_fringe(skeleton: NDArray[Any], *, min_length: float = 0.0) -> PixelGra
 
     Node pixels that touch are one node, at their mean rounded down. Lines that return to their own node are
     dropped, and closed lines without a node are never found: that is the published method.
-    `probe2road.tracing.trace_pixels` keeps both.
+    `probe2road.vectorize.tracing.trace_pixels` keeps both.
 
     Parameters
     ----------

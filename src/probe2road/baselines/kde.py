@@ -17,7 +17,7 @@ from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, TraceGaps
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.raster import fleet_grid
+from probe2road.raster.counts import fleet_grid
 from probe2road.workspace import Progress, open_workspace, silent
 
 __all__ = ["KdeOptions", "build_kde"]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from probe2road.fleet import Fleet, TraceGaps, trace_breaks
-from probe2road.grid import Grid, Window
+from probe2road.raster.grid import Grid, Window
 
 __all__ = ["Pillars", "VoxelCounts", "count_voxels", "dense_pillars", "pillars_from_voxels"]
 

@@ -24,7 +24,7 @@ from probe2road.baselines.volume import Pillars
 from probe2road.graph.clean import drop_edges, merge_degree_two_nodes
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import empty_turns, finish_edges
-from probe2road.grid import Grid
+from probe2road.raster.grid import Grid
 
 __all__ = ["graph_from_volume", "voxel_links"]
 

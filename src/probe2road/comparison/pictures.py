@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from probe2road.fleet import Fleet
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.grid import Grid
 from probe2road.picture import Stage, write_filmstrip
-from probe2road.raster import rasterize
+from probe2road.raster.counts import rasterize
+from probe2road.raster.grid import Grid
 
 __all__ = ["busiest_places", "draw_place"]
 

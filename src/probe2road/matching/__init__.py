@@ -1,1 +1,1 @@
-"""What `probe2road.mapmatch` is made of: states, observations, two hidden Markov models, tables."""
+"""What `probe2road.matching.match` is made of: states, observations, two hidden Markov models, tables."""

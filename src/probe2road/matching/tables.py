@@ -1,4 +1,4 @@
-"""Matched paths as the tables that `probe2road.mapmatch.Matches` promises."""
+"""Matched paths as the tables that `probe2road.matching.match.Matches` promises."""
 
 from __future__ import annotations
 

@@ -24,7 +24,10 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.crs import same_crs
-from probe2road.edge_frame import (
+from probe2road.errors import CRSError, OptionError
+from probe2road.fleet import Fleet
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.matching.frame import (
     EdgeLines,
     FramedFixes,
     Stations,
@@ -36,10 +39,7 @@ from probe2road.edge_frame import (
     smooth_stations,
     stations_along,
 )
-from probe2road.errors import CRSError, OptionError
-from probe2road.fleet import Fleet
-from probe2road.graph.roadgraph import RoadGraph
-from probe2road.mapmatch import Matches
+from probe2road.matching.match import Matches
 
 __all__ = ["CentrelineOptions", "refine_centreline"]
 
@@ -92,7 +92,7 @@ def refine_centreline(
     fleet
         The fleet that was matched.
     matches
-        From `probe2road.mapmatch.match`.
+        From `probe2road.matching.match.match`.
     options
         The defaults where it is None.
 
@@ -112,7 +112,7 @@ def refine_centreline(
     Three traces each way, 3 m apart, on a road that is drawn 2 m too far north:
 
     >>> from probe2road.fleet import fleet_from_tables
-    >>> from probe2road.mapmatch import match
+    >>> from probe2road.matching.match import match
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 2), (400, 2)]], crs="EPSG:32616")
     >>> there = pd.DataFrame({"t": range(40), "x": np.arange(5.0, 400, 10), "y": -1.5})

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.special import betaln
 
 from probe2road.crs import same_crs
-from probe2road.edge_frame import FramedFixes, Traversals, edge_lines, frame, robust_sigma
 from probe2road.errors import CRSError, OptionError
 from probe2road.fleet import Fleet
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.mapmatch import Matches, turn_counts
+from probe2road.matching.frame import FramedFixes, Traversals, edge_lines, frame, robust_sigma
+from probe2road.matching.match import Matches, turn_counts
 from probe2road.refinement.heights import HeightOptions, with_heights
 
 __all__ = ["EVIDENCE_COLUMNS", "EvidenceOptions", "add_evidence", "drive_numbers", "oneway_probabilities"]
@@ -86,7 +86,7 @@ def add_evidence(
     fleet
         The fleet that was matched.
     matches
-        From `probe2road.mapmatch.match`.
+        From `probe2road.matching.match.match`.
     options
         The defaults where it is None.
 
@@ -105,7 +105,7 @@ def add_evidence(
     Examples
     --------
     >>> from probe2road.fleet import fleet_from_tables
-    >>> from probe2road.mapmatch import match
+    >>> from probe2road.matching.match import match
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 80)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(4), "x": [80.0, 60, 40, 20], "y": 0.0, "z": 7.0})

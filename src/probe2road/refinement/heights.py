@@ -18,7 +18,10 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from probe2road.edge_frame import (
+from probe2road.errors import OptionError
+from probe2road.fleet import Fleet
+from probe2road.graph.roadgraph import RoadGraph
+from probe2road.matching.frame import (
     FramedFixes,
     Stations,
     Traversals,
@@ -28,9 +31,6 @@ from probe2road.edge_frame import (
     smooth_stations,
     stations_along,
 )
-from probe2road.errors import OptionError
-from probe2road.fleet import Fleet
-from probe2road.graph.roadgraph import RoadGraph
 
 __all__ = ["HeightOptions", "with_heights"]
 
@@ -77,7 +77,7 @@ def with_heights(
     graph, fleet
         The graph that was matched on, and the fleet that was matched.
     driven, fixes
-        From `probe2road.edge_frame.frame`.
+        From `probe2road.matching.frame.frame`.
     options
         The defaults where it is None.
 
@@ -87,9 +87,9 @@ def with_heights(
 
     Examples
     --------
-    >>> from probe2road.edge_frame import frame
+    >>> from probe2road.matching.frame import frame
     >>> from probe2road.fleet import fleet_from_tables
-    >>> from probe2road.mapmatch import match
+    >>> from probe2road.matching.match import match
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(9), "x": np.arange(10.0, 100, 10), "y": 0.0, "z": 7.0})

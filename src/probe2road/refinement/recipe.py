@@ -14,7 +14,7 @@ from probe2road.errors import OptionError
 from probe2road.fleet import Fleet
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.mapmatch import Matches, MatchOptions, match
+from probe2road.matching.match import Matches, MatchOptions, match
 from probe2road.refinement.centreline import CentrelineOptions, refine_centreline
 from probe2road.refinement.evidence import EvidenceOptions, add_evidence
 from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, fill_jumps, gap_weights, prune_gaps
@@ -80,7 +80,7 @@ def refine_graph(
     Parameters
     ----------
     graph
-        From `probe2road.vectorize`, or any other without evidence.
+        From `probe2road.vectorize.lines`, or any other without evidence.
     fleet
         The fleet, in the graph's CRS.
     options

@@ -45,7 +45,7 @@ def drop_undriven(
     graph
         Any road graph.
     steps
-        Matched paths on that graph: `probe2road.mapmatch.Matches.steps`.
+        Matched paths on that graph: `probe2road.matching.match.Matches.steps`.
     min_traces
         Distinct traces that must be matched to an edge; 0 keeps all.
     rungs

@@ -26,7 +26,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OptionError
-from probe2road.skeleton import Method, skeletonize
+from probe2road.vectorize.skeleton import Method, skeletonize
 
 __all__ = ["Buffer", "WrongSkeletons", "connectivity_weights", "dilate", "distances", "proximity", "wrong_skeletons"]
 

@@ -31,7 +31,7 @@ from scipy import ndimage
 
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, TraceGaps
-from probe2road.grid import Grid
+from probe2road.raster.grid import Grid
 from probe2road.segmentation.bandwidth import estimate_bandwidth
 from probe2road.segmentation.segmenter import Segmenter
 

@@ -24,7 +24,7 @@ from typing import cast
 
 from probe2road.errors import InputError, OptionError, needs_extra
 from probe2road.segmentation.connectivity import Buffer, connectivity_weights
-from probe2road.skeleton import Method
+from probe2road.vectorize.skeleton import Method
 
 with needs_extra("train", feature="training the segmentation network"):
     import torch

@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from probe2road.errors import OptionError
-from probe2road.grid import sparse_zeros
+from probe2road.raster.grid import sparse_zeros
 
 __all__ = ["threshold_mask"]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet import Fleet
-from probe2road.grid import Grid
-from probe2road.raster import CHANNELS
+from probe2road.raster.counts import CHANNELS
+from probe2road.raster.grid import Grid
 from probe2road.segmentation.runtime import DEVICES, load_network, run_network
 from probe2road.segmentation.segmenter import Segmenter
 from probe2road.segmentation.weights import ModelInfo, Weights, network_input, read_weights

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe2road.grid import Grid
+from probe2road.raster.grid import Grid
 
 __all__ = ["Segmenter"]
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError
-from probe2road.grid import Grid, Window, sparse_zeros
+from probe2road.raster.grid import Grid, Window, sparse_zeros
 from probe2road.segmentation.segmenter import Segmenter
 
 __all__ = ["add_window", "predict_window", "raster_windows", "segment_raster"]
@@ -61,7 +61,7 @@ def segment_raster(segmenter: Segmenter, counts: NDArray[Any], grid: Grid) -> ND
     --------
     >>> from probe2road.segmentation.density import DensityOptions, density_segmenter
     >>> from probe2road.demo import demo_fleet
-    >>> from probe2road.raster import fleet_grid, rasterize
+    >>> from probe2road.raster.counts import fleet_grid, rasterize
     >>> fleet = demo_fleet(n_drives=5)
     >>> grid = fleet_grid(fleet)
     >>> segmenter = density_segmenter(fleet, grid, DensityOptions(bandwidth=4.0))
@@ -82,7 +82,7 @@ def segment_raster(segmenter: Segmenter, counts: NDArray[Any], grid: Grid) -> ND
 
 
 def raster_windows(counts: NDArray[Any], grid: Grid, *, size: int, halo: int) -> Iterator[tuple[Window, NDArray[Any]]]:
-    """Cut a raster into windows as `probe2road.raster.rasterize_windows` does, with zeros beyond its border.
+    """Cut a raster into windows as `probe2road.raster.counts.rasterize_windows` does, with zeros beyond its border.
 
     Yields
     ------

@@ -39,7 +39,7 @@ class ModelInfo:
     """What a network expects and promises, and where it comes from."""
 
     name: str  # of the model, for reports
-    channels: tuple[str, ...]  # what it looks at, in its order; names of probe2road.raster.CHANNELS
+    channels: tuple[str, ...]  # what it looks at, in its order; names of probe2road.raster.counts.CHANNELS
     network: dict[str, Any] = field(default_factory=dict)  # what the network is built from, for training
     resolution: float = 1.0  # m per pixel
     threshold: float = 0.5  # probability that continues a road

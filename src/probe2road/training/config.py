@@ -8,7 +8,7 @@ from pathlib import Path
 
 from probe2road.errors import OptionError
 from probe2road.options import load_options
-from probe2road.raster import CHANNELS
+from probe2road.raster.counts import CHANNELS
 from probe2road.segmentation.losses import LossOptions
 from probe2road.training.samples import SampleOptions
 from probe2road.training.sources import Source
@@ -35,7 +35,7 @@ class TrainConfig:
     name: str = "model"  # of the model
     seed: int = 1
     architecture: str = "compact"  # one of `probe2road.segmentation.dlinknet.ARCHITECTURES`
-    channels: tuple[str, ...] = CHANNELS  # of the input, out of `probe2road.raster.CHANNELS`
+    channels: tuple[str, ...] = CHANNELS  # of the input, out of `probe2road.raster.counts.CHANNELS`
     sources: tuple[Source, ...] = (Source(name="columbus", split="train"),)
     sample: SampleOptions = field(default_factory=SampleOptions)
     loss: LossOptions = field(default_factory=LossOptions)

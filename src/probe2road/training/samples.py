@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from probe2road.benchmark.tiles import TILE_SIZE
 from probe2road.errors import OptionError
-from probe2road.labels import draw_lines
-from probe2road.raster import count_pixels
+from probe2road.raster.counts import count_pixels
+from probe2road.raster.lines import draw_lines
 from probe2road.training.scene import Scene, rows_around
 
 __all__ = ["Sample", "SampleOptions", "Vectors", "draw_sample", "sample_vectors", "square", "square_vectors"]

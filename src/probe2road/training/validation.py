@@ -16,19 +16,19 @@ from numpy.typing import NDArray
 from probe2road.errors import InputError
 from probe2road.graph.clean import clean_graph
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.grid import Grid
 from probe2road.metrics.geo import geo
 from probe2road.metrics.itopo import itopo
 from probe2road.metrics.normalise import clip_graph
 from probe2road.metrics.scores import Score
 from probe2road.metrics.soft_f1 import soft_f1
+from probe2road.raster.grid import Grid
 from probe2road.segmentation.mask import threshold_mask
-from probe2road.skeleton import skeletonize
 from probe2road.training.config import ValidationOptions
 from probe2road.training.samples import SampleOptions, square
 from probe2road.training.scene import Scene
 from probe2road.training.sources import driven_reference, open_scene
-from probe2road.vectorize import vectorize
+from probe2road.vectorize.lines import vectorize
+from probe2road.vectorize.skeleton import skeletonize
 
 __all__ = ["Square", "validate", "validation_squares"]
 

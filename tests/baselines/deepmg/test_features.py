@@ -10,7 +10,7 @@ from probe2road.baselines.deepmg.features import PLANES, FeatureOptions, Steps, 
 from probe2road.baselines.deepmg.variants import find_variant
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, fleet_from_tables
-from probe2road.grid import Grid
+from probe2road.raster.grid import Grid
 
 CRS = "EPSG:32616"
 PUBLISHED, FIXED = find_variant("as_published"), find_variant("fixed")

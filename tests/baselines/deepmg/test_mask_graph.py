@@ -9,7 +9,7 @@ from probe2road.baselines.deepmg.mask_graph import mask_graph
 from probe2road.baselines.deepmg.variants import find_variant
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.grid import Grid
+from probe2road.raster.grid import Grid
 
 
 def graph_of(mask: np.ndarray, variant: str) -> RoadGraph:

@@ -21,7 +21,7 @@ from probe2road.errors import InputError, OptionError  # noqa: E402
 from probe2road.fleet import Fleet, fleet_from_tables  # noqa: E402
 from probe2road.graph.check import check_graph  # noqa: E402
 from probe2road.graph.roadgraph import graph_from_lines  # noqa: E402
-from probe2road.raster import fleet_grid  # noqa: E402
+from probe2road.raster.counts import fleet_grid  # noqa: E402
 
 CRS = "EPSG:32616"
 QUICK = TrainOptions(width=2, epochs=2, learning_rate=0.01, validate_every=1)

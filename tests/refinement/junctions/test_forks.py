@@ -10,7 +10,7 @@ from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
-from probe2road.mapmatch import match
+from probe2road.matching.match import match
 from probe2road.refinement.junctions.forks import ForkOptions, find_forks, move_forks
 
 CRS = "EPSG:32616"

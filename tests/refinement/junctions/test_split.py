@@ -11,7 +11,7 @@ from probe2road.errors import InputError, OptionError
 from probe2road.fleet import fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
-from probe2road.mapmatch import match
+from probe2road.matching.match import match
 from probe2road.refinement.junctions.passages import node_passages, passing_positions
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from probe2road.fleet import Fleet, TraceGaps, trace_breaks
-from probe2road.grid import Grid, Window
+from probe2road.raster.grid import Grid, Window
 
 __all__ = ["LEVELS", "blur", "blur_kernel", "close_with_disk", "level_ranks", "trip_lines"]
 

@@ -14,7 +14,7 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
-from probe2road.skeleton import FIXED, SET, skeleton_pixels, thin_state
+from probe2road.vectorize.skeleton import FIXED, SET, skeleton_pixels, thin_state
 
 __all__ = ["gray_skeleton"]
 

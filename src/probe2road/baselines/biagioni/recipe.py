@@ -22,9 +22,9 @@ from probe2road.baselines.biagioni.traversals import Observations, Runs, good_ru
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, TraceGaps
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.grid import Grid
 from probe2road.matching.models import PublishedModel
-from probe2road.raster import fleet_grid
+from probe2road.raster.counts import fleet_grid
+from probe2road.raster.grid import Grid
 from probe2road.workspace import Progress, Workspace, open_workspace, silent
 
 __all__ = ["FLEET", "SIGMAS", "BiagioniOptions", "build_biagioni"]

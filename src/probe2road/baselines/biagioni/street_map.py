@@ -18,8 +18,8 @@ from probe2road.baselines.biagioni.density import LEVELS
 from probe2road.baselines.fringe import trace_fringe
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import empty_turns, finish_edges
-from probe2road.grid import Grid
-from probe2road.vectorize import VectorizeOptions, graph_from_pixels
+from probe2road.raster.grid import Grid
+from probe2road.vectorize.lines import VectorizeOptions, graph_from_pixels
 
 __all__ = ["Pieces", "initial_map", "straight_pieces"]
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from probe2road.baselines.deepmg.variants import Variant
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet, TraceGaps, trace_breaks
-from probe2road.grid import Grid
+from probe2road.raster.grid import Grid
 
 __all__ = ["COARSE_CELLS", "PLANES", "FeatureOptions", "Steps", "extract_features", "thin_traces"]
 

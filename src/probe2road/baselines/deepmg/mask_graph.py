@@ -13,9 +13,9 @@ from probe2road.baselines.fringe import trace_fringe
 from probe2road.graph.clean import drop_dead_ends
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import finish_edges
-from probe2road.grid import Grid
-from probe2road.skeleton import skeletonize_windows
-from probe2road.vectorize import VectorizeOptions, graph_from_pixels, vectorize
+from probe2road.raster.grid import Grid
+from probe2road.vectorize.lines import VectorizeOptions, graph_from_pixels, vectorize
+from probe2road.vectorize.skeleton import skeletonize_windows
 
 __all__ = ["mask_graph"]
 
@@ -28,8 +28,8 @@ def mask_graph(mask: NDArray[np.bool_], grid: Grid, variant: Variant) -> RoadGra
     """Turn a mask into a road graph.
 
     The published code follows the skeleton from node to node by the fringe method and keeps one line between any two
-    nodes, which loses parallel roads and loops. The other variant traces the same skeleton with `probe2road.vectorize`,
-    which keeps them.
+    nodes, which loses parallel roads and loops. The other variant traces the same skeleton with
+    `probe2road.vectorize.lines`, which keeps them.
 
     Parameters
     ----------

@@ -16,8 +16,8 @@ from probe2road.baselines.deepmg.t2rnet import T2RNet
 from probe2road.baselines.deepmg.tiles import TILE_CELLS
 from probe2road.baselines.deepmg.variants import Variant, find_variant
 from probe2road.errors import InputError, needs_extra
-from probe2road.grid import Grid, Window
 from probe2road.io.atomic import atomic_path
+from probe2road.raster.grid import Grid, Window
 
 with needs_extra("train", feature="DeepMG"):
     import torch

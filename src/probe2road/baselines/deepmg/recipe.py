@@ -20,8 +20,8 @@ from probe2road.baselines.deepmg.variants import find_variant
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet import Fleet, TraceGaps
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.grid import Grid
-from probe2road.raster import fleet_grid
+from probe2road.raster.counts import fleet_grid
+from probe2road.raster.grid import Grid
 from probe2road.segmentation.mask import threshold_mask
 from probe2road.workspace import Progress, Workspace, open_workspace, silent
 

@@ -125,7 +125,7 @@ def fill_jumps(graph: RoadGraph, steps: pd.DataFrame, *, options: GapOptions | N
     graph
         Any road graph.
     steps
-        Matched paths on it: `probe2road.mapmatch.Matches.steps`.
+        Matched paths on it: `probe2road.matching.match.Matches.steps`.
     options
         The defaults where it is None.
 
@@ -180,7 +180,7 @@ def prune_gaps(graph: RoadGraph, steps: pd.DataFrame, *, min_traces: int = 4) ->
     graph
         Result of `fill_gaps`.
     steps
-        Matched paths on that graph: `probe2road.mapmatch.Matches.steps`.
+        Matched paths on that graph: `probe2road.matching.match.Matches.steps`.
     min_traces
         Distinct traces that must enter a gap edge at one end and leave it at the other.
 

@@ -26,7 +26,7 @@ def jumped_gaps(graph: RoadGraph, steps: pd.DataFrame, options: GapOptions) -> N
     graph
         Any road graph.
     steps
-        Paths matched on it: `probe2road.mapmatch.Matches.steps`.
+        Paths matched on it: `probe2road.matching.match.Matches.steps`.
     options
         Of which ``max_jump``, ``min_jumps``, ``jump_turn`` and ``heading_length`` are used.
 

@@ -85,7 +85,7 @@ def open_braids(graph: RoadGraph, steps: pd.DataFrame, *, options: BraidOptions 
     graph
         Any road graph.
     steps
-        Paths matched on it: `probe2road.mapmatch.Matches.steps`.
+        Paths matched on it: `probe2road.matching.match.Matches.steps`.
     options
         The defaults where it is None.
 

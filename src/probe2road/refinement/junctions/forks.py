@@ -29,13 +29,13 @@ import shapely
 from numpy.typing import NDArray
 from shapely.ops import substring
 
-from probe2road.edge_frame import FramedFixes, Traversals, frame
 from probe2road.errors import OptionError
 from probe2road.fleet import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import finish_edges
 from probe2road.graph.topology import directions_away, end_nodes
-from probe2road.mapmatch import Matches
+from probe2road.matching.frame import FramedFixes, Traversals, frame
+from probe2road.matching.match import Matches
 
 __all__ = ["ForkOptions", "Forks", "find_forks", "move_forks"]
 
@@ -99,7 +99,7 @@ def move_forks(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: For
     fleet
         The fleet that was matched.
     matches
-        From `probe2road.mapmatch.match`.
+        From `probe2road.matching.match.match`.
     options
         The defaults where it is None.
 
@@ -117,7 +117,7 @@ def move_forks(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: For
     A ramp that leaves at 100 m, traced from a mask that saw it from 150 m on:
 
     >>> from probe2road.fleet import fleet_from_tables
-    >>> from probe2road.mapmatch import match
+    >>> from probe2road.matching.match import match
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> lines = [[(0, 0), (150, 0)], [(150, 0), (160, 0), (300, 0)], [(150, 0), (160, -6), (300, -20)]]
     >>> graph = graph_from_lines(lines, crs="EPSG:32616")

@@ -23,7 +23,7 @@ from probe2road.errors import InputError
 from probe2road.fleet import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.topology import end_nodes
-from probe2road.mapmatch import Matches
+from probe2road.matching.match import Matches
 
 __all__ = [
     "Passages",
@@ -125,7 +125,7 @@ def passing_positions(fleet: Fleet, matches: Matches, graph: RoadGraph) -> pd.Da
     Examples
     --------
     >>> from probe2road.fleet import fleet_from_tables
-    >>> from probe2road.mapmatch import match
+    >>> from probe2road.matching.match import match
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(4), "x": [70.0, 90, 110, 130], "y": 0.0, "z": [4.0, 5, 7, 8]})

@@ -101,7 +101,7 @@ def split_false_junctions(
     graph
         Any road graph.
     steps
-        Paths matched on it: `probe2road.mapmatch.Matches.steps`.
+        Paths matched on it: `probe2road.matching.match.Matches.steps`.
     positions
         Result of `probe2road.refinement.junctions.passages.passing_positions`; only the guarded variant uses them.
     options

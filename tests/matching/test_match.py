@@ -16,7 +16,7 @@ from probe2road.errors import CRSError, InputError, OptionError
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.graph.tables import empty_turns, finish_edges
-from probe2road.mapmatch import Matches, MatchOptions, match, turn_counts
+from probe2road.matching.match import Matches, MatchOptions, match, turn_counts
 from probe2road.matching.models import PublishedModel, RouteModel
 from probe2road.matching.network import build_states
 from probe2road.matching.published import emission_table, transition

@@ -11,14 +11,15 @@ import pytest
 import shapely
 from scipy import ndimage
 
-from probe2road import osrm as osrm_module
 from probe2road.errors import CRSError, InputError, MissingExtraError, OptionError
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
-from probe2road.grid import Grid
-from probe2road.labels import LabelOptions, cut_reference, label_mask, label_reference
-from probe2road.osrm import OsrmOptions, find_osrm, osrm_network, osrm_segments, osrm_server
+from probe2road.matching import osrm as osrm_module
+from probe2road.matching.labels import LabelOptions, cut_reference, label_reference
+from probe2road.matching.osrm import OsrmOptions, find_osrm, osrm_network, osrm_segments, osrm_server
+from probe2road.raster.grid import Grid
+from probe2road.raster.lines import label_mask
 from probe2road.simulate.fleet_simulation import simulate
 from probe2road.simulate.generate import generate_interchange
 

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from probe2road.errors import InputError, OptionError
 from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.graph.tables import empty_turns, finish_edges
-from probe2road.raster import Grid
-from probe2road.skeleton import skeleton_pixels
-from probe2road.tracing import PixelGraph, trace_pixels
+from probe2road.raster.counts import Grid
+from probe2road.vectorize.skeleton import skeleton_pixels
+from probe2road.vectorize.tracing import PixelGraph, trace_pixels
 
 __all__ = ["VectorizeOptions", "graph_from_pixels", "vectorize"]
 
@@ -65,7 +65,7 @@ def vectorize(
     Parameters
     ----------
     skeleton
-        Shape ``(rows, cols)``, from `probe2road.skeleton.skeletonize`; an array or a memory map.
+        Shape ``(rows, cols)``, from `probe2road.vectorize.skeleton.skeletonize`; an array or a memory map.
     grid
         The skeleton's grid.
     probability

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from probe2road.errors import CRSError, InputError
 from probe2road.fleet import Fleet, TraceGaps, trace_breaks
-from probe2road.grid import Grid, Window, sparse_zeros
+from probe2road.raster.grid import Grid, Window, sparse_zeros
 
 __all__ = [
     "CHANNELS",

@@ -5,7 +5,7 @@ import pytest
 import rasterio
 
 from probe2road.errors import CRSError, InputError, OptionError
-from probe2road.grid import Grid, read_raster, sparse_zeros, write_raster
+from probe2road.raster.grid import Grid, read_raster, sparse_zeros, write_raster
 
 CRS = "EPSG:32616"
 

@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OptionError
-from probe2road.grid import sparse_zeros
+from probe2road.raster.grid import sparse_zeros
 
 __all__ = ["FIXED", "METHODS", "SET", "Method", "skeleton_pixels", "skeletonize", "skeletonize_windows", "thin_state"]
 

@@ -12,22 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import shapely
-from numba import njit
-from numpy.typing import NDArray
 
 from probe2road.crs import same_crs
-from probe2road.edge_frame import frame
 from probe2road.errors import CRSError, OptionError
 from probe2road.fleet import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.splitting import split_edges
 from probe2road.graph.tables import empty_turns, finish_edges
-from probe2road.grid import Grid
-from probe2road.mapmatch import MatchOptions, match
-from probe2road.osrm import OsrmOptions, osrm_network, osrm_segments, osrm_server
+from probe2road.matching.frame import frame
+from probe2road.matching.match import MatchOptions, match
+from probe2road.matching.osrm import OsrmOptions, osrm_network, osrm_segments, osrm_server
 
-__all__ = ["MATCHERS", "LabelOptions", "cut_reference", "draw_lines", "label_mask", "label_pieces", "label_reference"]
+__all__ = ["MATCHERS", "LabelOptions", "cut_reference", "label_pieces", "label_reference"]
 
 logger = logging.getLogger(__name__)
 
@@ -173,92 +169,6 @@ def cut_reference(reference: RoadGraph, *, max_piece: float = 100.0) -> RoadGrap
     return split_edges(named, reference.edges.index.to_numpy()[row], along)[0]
 
 
-def label_mask(graph: RoadGraph, grid: Grid, *, width: int = 1) -> NDArray[np.uint8]:
-    """Draw the edges of a graph as lines: 1 on a line, 0 elsewhere.
-
-    Lines of width 1 are Bresenham's, one pixel wide and connected over edges and corners of pixels. Wider lines are
-    those dilated to a square of so many pixels (an even width reaches one pixel further up and left). What lies
-    outside the grid is left out.
-
-    Parameters
-    ----------
-    graph
-        In the CRS of the grid.
-    grid
-        Where to draw.
-    width
-        Pixels.
-
-    Returns
-    -------
-    ndarray of uint8, shape (rows, cols)
-
-    Raises
-    ------
-    CRSError
-        If graph and grid are in different CRS.
-    OptionError
-        If the width is below 1.
-
-    Examples
-    --------
-    >>> from probe2road.graph.roadgraph import graph_from_lines
-    >>> graph = graph_from_lines([[(900.5, 0.5), (902.5, 0.5), (904.5, 2.5)]], crs="EPSG:32616")
-    >>> label_mask(graph, Grid.from_bounds(graph.bounds, crs=graph.crs))
-    array([[0, 0, 0, 0, 1],
-           [0, 0, 0, 1, 0],
-           [1, 1, 1, 0, 0]], dtype=uint8)
-    """
-    if not same_crs(graph.crs, grid.crs):
-        fault = f"the graph is in {graph.crs.name}, the grid is in {grid.crs.name}"
-        raise CRSError(fault, where="label_mask", fix="use graph.to_crs")
-    xy, owner = shapely.get_coordinates(graph.edges.geometry.to_numpy(), return_index=True)
-    return draw_lines(*grid.rowcol(xy[:, 0], xy[:, 1]), owner, grid.shape, width=width)
-
-
-def draw_lines(
-    row: NDArray[np.int64],
-    col: NDArray[np.int64],
-    owner: NDArray[np.int64],
-    shape: tuple[int, int],
-    *,
-    width: int = 1,
-) -> NDArray[np.uint8]:
-    """Draw lines that are in pixel coordinates already; see `label_mask`.
-
-    Parameters
-    ----------
-    row, col
-        Pixels of v vertices; they may lie outside.
-    owner
-        Line of each vertex, shape ``(v,)``; the vertices of a line follow each other.
-    shape
-        ``(rows, cols)`` of the mask.
-    width
-        Pixels.
-
-    Returns
-    -------
-    ndarray of uint8, shape (rows, cols)
-
-    Raises
-    ------
-    OptionError
-        If the width is below 1.
-
-    Examples
-    --------
-    >>> draw_lines(np.array([0, 0]), np.array([1, 3]), np.array([5, 5]), (2, 4), width=2)
-    array([[1, 1, 1, 1],
-           [0, 0, 0, 0]], dtype=uint8)
-    """
-    if width < 1:
-        raise OptionError(f"width is {width}", where="draw_lines", fix="use 1 pixel or more")
-    mask = np.zeros(shape, np.uint8)
-    _draw(row, col, owner.astype(np.int64), width // 2, (width - 1) // 2, mask)
-    return mask
-
-
 def _covered_by_own(pieces: RoadGraph, fleet: Fleet, options: LabelOptions) -> pd.DataFrame:
     """List the stretches that traces cover, by our own matcher: ``trace``, ``edge`` (row), ``low``, ``high`` (m)."""
     driven, _ = frame(pieces, fleet, match(fleet, pieces, options.match))
@@ -285,38 +195,3 @@ def _joined(table: pd.DataFrame) -> pd.DataFrame:
     reached = table.groupby(["trace", "edge"])["high"].cummax()
     before = reached.groupby([table["trace"], table["edge"]]).shift(1).fillna(-np.inf)
     return table.assign(length=(table["high"] - np.maximum(table["low"], before)).clip(lower=0.0))
-
-
-@njit(cache=True)
-def _draw(
-    row: NDArray[np.int64],
-    col: NDArray[np.int64],
-    owner: NDArray[np.int64],
-    before: int,
-    after: int,
-    mask: NDArray[np.uint8],
-) -> None:
-    """Set the pixels of Bresenham's lines between the vertices of each owner, and ``before``/``after`` around them.
-
-    Every line is drawn from its northern (then western) end, so that it does not matter which way an edge runs.
-    """
-    for k in range(1, len(row)):
-        if owner[k] != owner[k - 1]:
-            continue
-        a, b = k - 1, k
-        if row[a] > row[b] or (row[a] == row[b] and col[a] > col[b]):
-            a, b = b, a
-        r, c = row[a], col[a]
-        d_row, d_col = row[b] - row[a], abs(col[b] - col[a])
-        east = 1 if col[b] >= col[a] else -1
-        steps, minor = max(d_row, d_col), min(d_row, d_col)
-        error = steps // 2
-        for _ in range(steps + 1):
-            for i in range(max(r - before, 0), min(r + after + 1, mask.shape[0])):
-                for j in range(max(c - before, 0), min(c + after + 1, mask.shape[1])):
-                    mask[i, j] = 1
-            error -= minor
-            slip = error < 0
-            error += steps if slip else 0
-            r += 1 if d_row > d_col or slip else 0
-            c += east if d_row <= d_col or slip else 0

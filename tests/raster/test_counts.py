@@ -4,8 +4,8 @@ import pytest
 
 from probe2road.errors import CRSError, InputError
 from probe2road.fleet import Fleet, TraceGaps, fleet_from_tables
-from probe2road.grid import Grid
-from probe2road.raster import fleet_grid, rasterize, rasterize_windows
+from probe2road.raster.counts import fleet_grid, rasterize, rasterize_windows
+from probe2road.raster.grid import Grid
 
 CRS = "EPSG:32616"
 ORIGIN = np.array([446000.0, 4636000.0])

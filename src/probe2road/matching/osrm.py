@@ -29,11 +29,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.crs import WGS84, transform
-from probe2road.edge_frame import courses, edge_lines, stations_along
 from probe2road.errors import InputError, MissingExtraError, OptionError, Probe2RoadError
 from probe2road.fleet import Fleet
 from probe2road.graph.direction import driving_direction
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.matching.frame import courses, edge_lines, stations_along
 
 __all__ = ["OsrmNetwork", "OsrmOptions", "find_osrm", "osrm_network", "osrm_segments", "osrm_server"]
 

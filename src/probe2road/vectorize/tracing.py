@@ -67,7 +67,8 @@ def trace_pixels(row: NDArray[np.int64], col: NDArray[np.int64]) -> PixelGraph:
     Parameters
     ----------
     row, col
-        The pixels, each once, sorted by row and then column, as `probe2road.skeleton.skeleton_pixels` lists them.
+        The pixels, each once, sorted by row and then column, as `probe2road.vectorize.skeleton.skeleton_pixels` lists
+        them.
 
     Returns
     -------
@@ -89,7 +90,7 @@ def trace_pixels(row: NDArray[np.int64], col: NDArray[np.int64]) -> PixelGraph:
     --------
     A T of five pixels has one junction and three dead ends:
 
-    >>> from probe2road.skeleton import skeleton_pixels
+    >>> from probe2road.vectorize.skeleton import skeleton_pixels
     >>> graph = trace_pixels(*skeleton_pixels(np.array([[1, 1, 1], [0, 1, 0], [0, 1, 0]])))
     >>> graph.start.tolist(), graph.stop.tolist()
     ([0, 1, 1], [1, 2, 3])

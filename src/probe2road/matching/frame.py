@@ -24,7 +24,7 @@ from scipy.linalg import solveh_banded
 from probe2road.errors import InputError
 from probe2road.fleet import Fleet
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.mapmatch import Matches
+from probe2road.matching.match import Matches
 
 __all__ = [
     "EdgeLines",
@@ -211,7 +211,7 @@ def frame(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[Traversals,
     Examples
     --------
     >>> from probe2road.fleet import fleet_from_tables
-    >>> from probe2road.mapmatch import match
+    >>> from probe2road.matching.match import match
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(3), "x": [40.0, 90, 140], "y": [2.0, 1, -1]})

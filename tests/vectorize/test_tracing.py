@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError
-from probe2road.tracing import PixelGraph, trace_pixels
+from probe2road.vectorize.tracing import PixelGraph, trace_pixels
 
 
 def trace(*rows: str) -> PixelGraph:

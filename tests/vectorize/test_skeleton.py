@@ -9,7 +9,15 @@ from scipy.ndimage import gaussian_filter
 from skimage.morphology import thin
 
 from probe2road.errors import InputError, OptionError
-from probe2road.skeleton import FIXED, SET, Method, skeleton_pixels, skeletonize, skeletonize_windows, thin_state
+from probe2road.vectorize.skeleton import (
+    FIXED,
+    SET,
+    Method,
+    skeleton_pixels,
+    skeletonize,
+    skeletonize_windows,
+    thin_state,
+)
 
 Mask = NDArray[np.bool_]
 

@@ -12,10 +12,10 @@ from rasterio.features import rasterize
 from probe2road.errors import InputError, OptionError
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.raster import Grid
-from probe2road.skeleton import skeleton_pixels, skeletonize
-from probe2road.tracing import trace_pixels
-from probe2road.vectorize import VectorizeOptions, vectorize
+from probe2road.raster.counts import Grid
+from probe2road.vectorize.lines import VectorizeOptions, vectorize
+from probe2road.vectorize.skeleton import skeleton_pixels, skeletonize
+from probe2road.vectorize.tracing import trace_pixels
 
 HALF_DIAGONAL = 0.5**0.5  # px
 

@@ -1,0 +1,1 @@
+"""The pixel plane: grids, and traces, points and lines drawn into them."""
