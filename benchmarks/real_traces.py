@@ -22,9 +22,9 @@ from typing import Any
 import pandas as pd
 
 from probe2road import evaluate, read_fleet, read_graph
+from probe2road.draw.picture import draw_graph
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.metrics import GeoOptions
-from probe2road.picture import draw_graph
 
 CITIES = {"chicago_shuttle": ("EPSG:32616", "trace_id=trip"), "athens_small": ("EPSG:2100", "trace_id=trip")}
 JUNCTIONS = {"chicago_shuttle": 3, "athens_small": 0}  # pictures of the busiest

@@ -17,15 +17,15 @@ from pathlib import Path
 from probe2road.benchmark.recording import POSES, Recording
 from probe2road.benchmark.reference import labelled_reference
 from probe2road.crs import WGS84, transform
-from probe2road.export import read_graph
+from probe2road.draw.picture import draw_graph
 from probe2road.fleet import Fleet
 from probe2road.graph.clean import clean_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path
+from probe2road.io.graph_files import read_graph
 from probe2road.matching.match import match
 from probe2road.metrics import evaluate
-from probe2road.picture import draw_graph
 from probe2road.recipe import BuildOptions, build
 from probe2road.refinement.centreline import refine_centreline
 from probe2road.refinement.evidence import add_evidence

@@ -19,8 +19,8 @@ from probe2road.baselines.deepmg.tiles import TileSet, open_tiles, tile_grids, w
 from probe2road.baselines.deepmg.training import TrainOptions, train
 from probe2road.benchmark.reference import labelled_reference
 from probe2road.errors import InputError
-from probe2road.export import read_graph
 from probe2road.io.fleet_reader import read_fleet
+from probe2road.io.graph_files import read_graph
 from probe2road.options import load_options
 
 logger = logging.getLogger("train_deepmg")

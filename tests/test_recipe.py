@@ -6,16 +6,16 @@ import pandas as pd
 import pytest
 
 from probe2road.errors import InputError, OptionError, OutputError
-from probe2road.export import read_graph
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.clean import CleanOptions
 from probe2road.graph.roadgraph import graph_from_lines
+from probe2road.io.graph_files import read_graph
 from probe2road.metrics import evaluate
 from probe2road.raster.grid import read_raster
 from probe2road.recipe import BuildOptions, build
+from probe2road.run.workspace import fingerprint
 from probe2road.segmentation.density import DensityOptions, density_probability
-from probe2road.workspace import fingerprint
 
 CRS = "EPSG:32616"
 ORIGIN = np.array([446000.0, 4636000.0])

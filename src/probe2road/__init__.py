@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0.dev0"
 
 if TYPE_CHECKING:
+    from probe2road.draw.page import write_view
     from probe2road.errors import Probe2RoadError
-    from probe2road.export import read_graph, write_graph
     from probe2road.fleet import Fleet, TraceGaps, fleet_from_tables
     from probe2road.graph.check import check_graph
     from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+    from probe2road.io.describe import describe_fleet
     from probe2road.io.fleet_reader import read_fleet
-    from probe2road.io.fleet_summary import describe_fleet
     from probe2road.io.fleet_writer import write_fleet
+    from probe2road.io.graph_files import read_graph, write_graph
     from probe2road.io.graph_networkx import from_networkx, to_networkx
     from probe2road.matching.labels import label_reference
     from probe2road.matching.match import Matches, MatchOptions, match
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from probe2road.raster.counts import rasterize
     from probe2road.recipe import BuildOptions, build
     from probe2road.refinement.recipe import refine_graph
-    from probe2road.view import write_view
 
 _HOME = {
     "Probe2RoadError": "errors",
@@ -35,12 +35,12 @@ _HOME = {
     "fleet_from_tables": "fleet",
     "read_fleet": "io.fleet_reader",
     "write_fleet": "io.fleet_writer",
-    "describe_fleet": "io.fleet_summary",
+    "describe_fleet": "io.describe",
     "RoadGraph": "graph.roadgraph",
     "check_graph": "graph.check",
     "graph_from_lines": "graph.roadgraph",
-    "read_graph": "export",
-    "write_graph": "export",
+    "read_graph": "io.graph_files",
+    "write_graph": "io.graph_files",
     "to_networkx": "io.graph_networkx",
     "from_networkx": "io.graph_networkx",
     "rasterize": "raster.counts",
@@ -52,7 +52,7 @@ _HOME = {
     "BuildOptions": "recipe",
     "build": "recipe",
     "evaluate": "metrics.evaluate",
-    "write_view": "view",
+    "write_view": "draw.page",
 }
 
 __all__ = [

@@ -20,7 +20,8 @@ from probe2road.alignment.screening import screen_drives
 from probe2road.alignment.tiling import align_tiles, find_tiles, moved_fleet
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet import POINT_KINDS, Fleet
-from probe2road.workspace import Progress, open_workspace
+from probe2road.run.progress import Progress
+from probe2road.run.workspace import open_workspace
 
 __all__ = ["AlignOptions", "Alignment", "add_drives", "align"]
 

@@ -8,16 +8,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from probe2road.export import write_graph
+from probe2road.draw.page import write_view
+from probe2road.draw.stages import draw_stages
 from probe2road.fleet import Fleet
 from probe2road.io.atomic import make_folder
 from probe2road.io.fleet_reader import read_fleet_files
 from probe2road.io.fleet_writer import write_fleet
+from probe2road.io.graph_files import write_graph
 from probe2road.metrics import evaluate
-from probe2road.recipe import Progress, build, draw_stages
+from probe2road.recipe import Progress, build
 from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
 from probe2road.simulate.generate import generate_interchange
-from probe2road.view import write_view
 
 __all__ = ["demo_fleet", "run_demo"]
 

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe2road.errors import OptionError
-from probe2road.export import read_graph
 from probe2road.fleet import Fleet, TraceGaps
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.picture import Stage, write_filmstrip
-from probe2road.raster.counts import fleet_grid, rasterize, rasterize_windows
-from probe2road.raster.grid import Grid, read_raster, sparse_zeros
+from probe2road.raster.counts import fleet_grid, rasterize_windows
+from probe2road.raster.grid import Grid, sparse_zeros
 from probe2road.refinement.recipe import RefineOptions, refine_graph
+from probe2road.run.progress import Progress, silent
+from probe2road.run.workspace import Workspace, open_workspace
 from probe2road.segmentation.density import DensityOptions, density_segmenter
 from probe2road.segmentation.mask import threshold_mask
 from probe2road.segmentation.network import NetworkOptions, find_weights, network_segmenter
@@ -27,9 +27,8 @@ from probe2road.segmentation.tiling import add_window, predict_window
 from probe2road.segmentation.weights import Weights
 from probe2road.vectorize.lines import VectorizeOptions, vectorize
 from probe2road.vectorize.skeleton import METHODS, Method, skeletonize_windows
-from probe2road.workspace import Progress, Workspace, open_workspace, silent
 
-__all__ = ["SEGMENTERS", "BuildOptions", "Progress", "Segmentation", "build", "draw_stages"]
+__all__ = ["SEGMENTERS", "BuildOptions", "Progress", "Segmentation", "build"]
 
 logger = logging.getLogger(__name__)
 
@@ -190,34 +189,3 @@ def _segment(
     work.write_raster("1-probability", probability, grid)
     work.drop_arrays()
     return probability
-
-
-def draw_stages(folder: str | Path, fleet: Fleet, path: str | Path) -> None:
-    """Draw what the stages of a run left in its workspace, side by side, as a PNG.
-
-    Parameters
-    ----------
-    folder
-        Workspace of a finished `build`.
-    fleet
-        The fleet it was built from.
-    path
-        The picture.
-
-    Raises
-    ------
-    InputError
-        If a stage is missing.
-    """
-    folder = Path(folder)
-    probability, grid = read_raster(folder / "1-probability.tif")
-    skeleton, _ = read_raster(folder / "3-skeleton.tif")
-    traces = rasterize(fleet, grid)[0]
-    panels = [
-        Stage("Traces", traces, grid, f"{fleet.n_traces:,} traces, {len(fleet.traces):,} fixes"),
-        Stage("Probability", probability[0], grid, "of a centreline"),
-        Stage("Skeleton", skeleton[0].astype(bool), grid, f"{int(skeleton.sum()):,} pixels"),
-        Stage("Graph", read_graph(folder / "4-vectorized.gpkg")),
-        Stage("Roads", read_graph(folder / "7-roads.gpkg")),
-    ]
-    write_filmstrip(panels, path)

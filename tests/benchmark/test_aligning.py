@@ -11,7 +11,7 @@ from probe2road.benchmark.aligning import align_dataset
 from probe2road.benchmark.datasets import find_dataset
 from probe2road.benchmark.prepare import check_dataset, prepare_dataset
 from probe2road.benchmark.recording import Recording
-from probe2road.cli import main
+from probe2road.cli.main import main
 from probe2road.comparison.source import Source, make_fleet
 from probe2road.errors import InputError
 from probe2road.io.fleet_reader import read_fleet_files

@@ -16,8 +16,8 @@ from probe2road.benchmark.recording import Recording
 from probe2road.benchmark.reference import MAIN_ROADS, labelled_reference
 from probe2road.benchmark.tiles import split_tiles
 from probe2road.errors import InputError, OptionError
-from probe2road.export import read_graph
 from probe2road.graph.check import check_graph
+from probe2road.io.graph_files import read_graph
 from probe2road.simulate.network import check_network
 
 ROADS = """<osm version="0.6">

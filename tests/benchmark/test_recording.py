@@ -10,9 +10,9 @@ from probe2road.benchmark import recording as module
 from probe2road.benchmark.recording import record_fleet
 from probe2road.benchmark.residual import ResidualModel, align_drives
 from probe2road.errors import OptionError, OutputError
-from probe2road.export import read_graph, write_graph
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path
+from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.simulate.fleet_simulation import simulate, simulate_chunks
 from probe2road.simulate.network import network_from_sections
 

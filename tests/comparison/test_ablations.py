@@ -5,7 +5,7 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
-from probe2road.cli import main
+from probe2road.cli.main import main
 from probe2road.comparison import ablations
 from probe2road.comparison.ablate import run_ablations
 from probe2road.comparison.ablations import BASE, find_ablations, vary

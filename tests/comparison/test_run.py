@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe2road.cli import main
+from probe2road.cli.main import main
 from probe2road.comparison.cells import build_cell, score_cells
 from probe2road.comparison.methods import METHODS, find_methods
 from probe2road.comparison.run import run_benchmark

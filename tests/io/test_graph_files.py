@@ -17,9 +17,9 @@ import shapely
 
 from probe2road.crs import local_crs
 from probe2road.errors import CRSError, InputError
-from probe2road.export import read_graph, write_graph
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.graph.tables import TURN_DTYPES
+from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.io.graph_readers import read_vector_graph
 
 EAST, NORTH = 446000.0, 4636000.0

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from probe2road.errors import InputError
-from probe2road.export import read_graph
 from probe2road.graph.check import check_graph
+from probe2road.io.graph_files import read_graph
 from probe2road.io.osm import read_osm
 
 DATA = Path(os.environ.get("PROBE2ROAD_DATA", "../shared/data"))

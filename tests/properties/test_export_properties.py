@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from probe2road.crs import local_crs
-from probe2road.export import read_graph, write_graph
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.graph.tables import TURN_DTYPES
+from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.io.graph_networkx import from_networkx, to_networkx
 
 # Greatest displacement of a vertex, metres. Exact formats are exact to the last bit.

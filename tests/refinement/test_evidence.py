@@ -11,11 +11,11 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.errors import CRSError, InputError, OptionError, OutputError
-from probe2road.export import read_graph, write_graph
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.direction import driving_direction
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.matching.frame import edge_lines, frame, smooth_stations, stations_along
 from probe2road.matching.match import match
 from probe2road.refinement.evidence import (

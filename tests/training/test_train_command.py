@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from probe2road.cli import main
+from probe2road.cli.main import main
 from probe2road.segmentation.weights import read_weights
 
 torch = pytest.importorskip("torch", reason="the extra 'train' is not installed")

@@ -23,8 +23,9 @@ from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.reckoning import wrapped
 from probe2road.alignment.screening import rows_of_points
 from probe2road.fleet import Fleet
-from probe2road.workers import in_processes
-from probe2road.workspace import Progress, Workspace
+from probe2road.run.progress import Progress
+from probe2road.run.workers import in_processes
+from probe2road.run.workspace import Workspace
 
 __all__ = ["Moves", "Tile", "align_tiles", "find_tiles", "moved_fleet"]
 

@@ -18,7 +18,8 @@ from probe2road.fleet import Fleet, TraceGaps
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster.counts import fleet_grid
-from probe2road.workspace import Progress, open_workspace, silent
+from probe2road.run.progress import Progress, silent
+from probe2road.run.workspace import open_workspace
 
 __all__ = ["KdeOptions", "build_kde"]
 

@@ -13,7 +13,7 @@ from probe2road.errors import InputError
 from probe2road.io.atomic import atomic_path
 from probe2road.io.fleet_reader import read_fleet_files
 from probe2road.io.fleet_writer import points_path, write_fleet
-from probe2road.workspace import Progress
+from probe2road.run.progress import Progress
 
 __all__ = ["align_dataset"]
 

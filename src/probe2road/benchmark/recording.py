@@ -25,10 +25,10 @@ import shapely
 
 from probe2road.benchmark.residual import ResidualModel, align_drives
 from probe2road.errors import OptionError, OutputError
-from probe2road.export import write_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path, make_folder
 from probe2road.io.fleet_writer import ROW_GROUP, bounding_box, point_table, with_geo
+from probe2road.io.graph_files import write_graph
 from probe2road.recipe import Progress
 from probe2road.simulate.fleet_simulation import FleetChunk, simulate_chunks
 from probe2road.simulate.network import RoadNetwork

@@ -18,7 +18,7 @@ from probe2road.comparison.source import Source
 from probe2road.comparison.tables import ablation_table, markdown_table
 from probe2road.errors import InputError
 from probe2road.io.atomic import atomic_path, make_folder
-from probe2road.workspace import Progress, silent
+from probe2road.run.progress import Progress, silent
 
 __all__ = ["run_ablations"]
 

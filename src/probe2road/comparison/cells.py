@@ -29,15 +29,15 @@ from probe2road.comparison.intervals import COUNTS
 from probe2road.comparison.measured import measure
 from probe2road.comparison.methods import Method
 from probe2road.comparison.source import Source, make_fleet
-from probe2road.export import read_graph, write_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path
+from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.metrics.evaluate import evaluate
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.raster.grid import read_raster
-from probe2road.workspace import copy_first_stage
+from probe2road.run.workspace import copy_first_stage
 
 __all__ = ["FULL", "STAGES", "Cell", "build_cell", "read_built", "score_cells", "score_graph", "write_cells"]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from probe2road.comparison.intervals import Interval
-from probe2road.picture import BLUE, DPI, FRAME, INK, ORANGE, PURPLE, SOFT, save_figure
+from probe2road.draw.picture import BLUE, DPI, FRAME, INK, ORANGE, PURPLE, SOFT, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from probe2road.workers import in_processes
+from probe2road.run.workers import in_processes
 
 __all__ = ["Measured", "measure"]
 

@@ -10,9 +10,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from probe2road.draw.picture import Stage, write_filmstrip
 from probe2road.fleet import Fleet
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.picture import Stage, write_filmstrip
 from probe2road.raster.counts import rasterize
 from probe2road.raster.grid import Grid
 

@@ -22,7 +22,7 @@ from probe2road.comparison.tables import (
 )
 from probe2road.io.atomic import atomic_path, make_folder
 from probe2road.io.fleet_reader import read_fleet
-from probe2road.workspace import Progress, silent
+from probe2road.run.progress import Progress, silent
 
 __all__ = ["CITIES", "run_benchmark"]
 

@@ -21,11 +21,11 @@ from probe2road.benchmark.recording import POSES, Recording
 from probe2road.benchmark.reference import labelled_reference
 from probe2road.benchmark.tiles import SPLITS, split_area
 from probe2road.errors import InputError, OptionError
-from probe2road.export import read_graph
 from probe2road.fleet import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet_files
 from probe2road.io.fleet_writer import write_fleet
+from probe2road.io.graph_files import read_graph
 
 __all__ = ["Source", "choose_drives", "make_fleet"]
 

@@ -23,7 +23,8 @@ from probe2road.refinement.junctions.forks import ForkOptions, move_forks
 from probe2road.refinement.junctions.passages import passing_positions
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
 from probe2road.refinement.undriven import RungOptions, drop_undriven
-from probe2road.workspace import Progress, Workspace, silent
+from probe2road.run.progress import Progress, silent
+from probe2road.run.workspace import Workspace
 
 __all__ = ["RefineOptions", "refine_graph"]
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from probe2road.errors import OptionError
 from probe2road.fleet import POINT_KINDS, Fleet
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.run.workers import in_processes
 from probe2road.simulate.camera import ROAD_BOUNDARY, Detections, FeatureIndex, feature_index, see
 from probe2road.simulate.features import RoadFeatures, road_features
 from probe2road.simulate.gnss import gnss_errors
@@ -28,7 +29,6 @@ from probe2road.simulate.odometry import fuse
 from probe2road.simulate.presets import Preset, RecordingModel, SurroundingsModel, find_preset
 from probe2road.simulate.records import DriveLabels, RecordedPoses, count_drives, drive_tables
 from probe2road.simulate.traffic import TrafficWorld, TruePoses, drive, traffic_world
-from probe2road.workers import in_processes
 
 __all__ = [
     "FleetChunk",

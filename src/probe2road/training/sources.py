@@ -17,9 +17,9 @@ from probe2road.benchmark.recording import POSES, Recording
 from probe2road.benchmark.reference import labelled_reference
 from probe2road.benchmark.tiles import split_area
 from probe2road.errors import InputError, OptionError
-from probe2road.export import read_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet, read_fleet_files
+from probe2road.io.graph_files import read_graph
 from probe2road.matching.labels import LabelOptions, label_pieces
 from probe2road.training.scene import Scene, load_scene, make_scene, save_scene
 

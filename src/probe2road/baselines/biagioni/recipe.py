@@ -25,7 +25,8 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.models import PublishedModel
 from probe2road.raster.counts import fleet_grid
 from probe2road.raster.grid import Grid
-from probe2road.workspace import Progress, Workspace, open_workspace, silent
+from probe2road.run.progress import Progress, silent
+from probe2road.run.workspace import Workspace, open_workspace
 
 __all__ = ["FLEET", "SIGMAS", "BiagioniOptions", "build_biagioni"]
 

@@ -22,8 +22,9 @@ from probe2road.fleet import Fleet, TraceGaps
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster.counts import fleet_grid
 from probe2road.raster.grid import Grid
+from probe2road.run.progress import Progress, silent
+from probe2road.run.workspace import Workspace, open_workspace
 from probe2road.segmentation.mask import threshold_mask
-from probe2road.workspace import Progress, Workspace, open_workspace, silent
 
 __all__ = ["DeepMGOptions", "build_deepmg"]
 

@@ -12,7 +12,6 @@ import hashlib
 import json
 import logging
 import shutil
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,25 +21,18 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.errors import OutputError
-from probe2road.export import read_graph, write_graph
 from probe2road.fleet import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path, make_folder
+from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.raster.grid import Grid, read_raster, write_raster
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["Progress", "Workspace", "copy_first_stage", "fingerprint", "open_workspace", "silent"]
+__all__ = ["Workspace", "copy_first_stage", "fingerprint", "open_workspace"]
 
 logger = logging.getLogger(__name__)
-
-Progress = Callable[[str, int, int], None]
-"""Called with the stage, how much of it is done, and how much there is."""
-
-
-def silent(stage: str, done: int, total: int) -> None:
-    """Report nothing: the progress of a run that nobody follows."""
 
 
 _MARK = "run.json"

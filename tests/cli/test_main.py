@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe2road.cli import main
-from probe2road.export import read_graph
+from probe2road.cli.main import main
+from probe2road.io.graph_files import read_graph
 
 
 def run(*arguments, cwd):

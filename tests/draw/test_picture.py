@@ -8,10 +8,10 @@ import pytest
 from matplotlib.image import imread
 from numpy.typing import NDArray
 
+from probe2road.draw.picture import Stage, draw_graph, write_filmstrip
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet import fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
-from probe2road.picture import Stage, draw_graph, write_filmstrip
 from probe2road.raster.grid import Grid
 
 UTM = "EPSG:32616"

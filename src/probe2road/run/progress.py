@@ -1,15 +1,20 @@
-"""A bar on the terminal for each stage of long work."""
+"""How far long work is: the callback that is told, and a bar on the terminal for each stage."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from probe2road.workspace import Progress
+__all__ = ["Progress", "progress_bar", "silent"]
 
-__all__ = ["progress_bar"]
+
+Progress = Callable[[str, int, int], None]
+"""Called with the stage, how much of it is done, and how much there is."""
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Report nothing: the progress of a run that nobody follows."""
 
 
 @contextmanager

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from probe2road.cli_benchmark import benchmark
+from probe2road.cli.benchmark import benchmark
 from probe2road.errors import OptionError, OutputError, Probe2RoadError
-from probe2road.progress_bar import progress_bar
+from probe2road.run.progress import progress_bar
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -98,9 +98,10 @@ def build(
 
     An interrupted run goes on where it stopped when it is started again.
     """
-    from probe2road.export import graph_format, write_graph
+    from probe2road.draw.stages import draw_stages
+    from probe2road.io.graph_files import graph_format, write_graph
     from probe2road.options import load_options
-    from probe2road.recipe import BuildOptions, draw_stages
+    from probe2road.recipe import BuildOptions
     from probe2road.recipe import build as build_graph
 
     for path in output:
@@ -187,8 +188,8 @@ def match(
     config: Annotated[Path | None, typer.Option(help="TOML file with matching options.")] = None,
 ) -> None:
     """Match traces to the edges of a road graph."""
-    from probe2road.export import read_graph
     from probe2road.io.atomic import atomic_path
+    from probe2road.io.graph_files import read_graph
     from probe2road.matching.match import MatchOptions
     from probe2road.matching.match import match as match_fleet
     from probe2road.options import load_options
@@ -217,8 +218,8 @@ def evaluate(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="CSV file for the scores.")] = None,
 ) -> None:
     """Score a road graph against a reference; both may be in any format that build writes, or OSM."""
-    from probe2road.export import read_graph
     from probe2road.io.atomic import atomic_path
+    from probe2road.io.graph_files import read_graph
     from probe2road.metrics import DEFAULT_METRICS
     from probe2road.metrics import evaluate as score
 
@@ -241,7 +242,7 @@ def info(
     no_header: NoHeader = False,
 ) -> None:
     """Describe fleet data or a road graph in figures."""
-    from probe2road.describe import describe_file
+    from probe2road.io.describe import describe_file
 
     figures = describe_file(
         file,
@@ -269,9 +270,9 @@ def view(
     no_header: NoHeader = False,
 ) -> None:
     """Draw a road graph over its traces: one HTML page that needs no network, or a picture."""
-    from probe2road.export import read_graph
-    from probe2road.picture import draw_graph
-    from probe2road.view import write_view
+    from probe2road.draw.page import write_view
+    from probe2road.draw.picture import draw_graph
+    from probe2road.io.graph_files import read_graph
 
     if output.suffix.lower() not in (".html", ".htm", ".png"):
         raise OptionError(f"cannot draw {output.suffix or 'no suffix'}", where=output, fix="use .html or .png")

@@ -20,10 +20,10 @@ import pandas as pd
 import pytest
 from matplotlib.image import imread
 
+from probe2road.draw.page import write_view
 from probe2road.errors import OptionError, OutputError
 from probe2road.fleet import Fleet, fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
-from probe2road.view import write_view
 
 EAST, NORTH = 446000.0, 4636000.0
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -127,15 +127,15 @@ def _page(*, title: str, summary: str, data: dict[str, Any]) -> str:
     read = {
         "maplibre_css": f"{_MAPLIBRE}/maplibre-gl.css",
         "maplibre_js": f"{_MAPLIBRE}/maplibre-gl.js",
-        "page_css": "_view/page.css",
-        "page_js": "_view/page.js",
+        "page_css": "draw/page_files/page.css",
+        "page_js": "draw/page_files/page.js",
     }
     parts = {name: package.joinpath(file).read_text(encoding="utf-8") for name, file in read.items()}
     parts["maplibre_js"] = re.sub(r"\n//# sourceMappingURL=.*", "", parts["maplibre_js"])
     # Inside a script element only "<" can end it or open a comment; in JSON it may be written as an escape.
     parts["data"] = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     parts |= {"title": html.escape(title), "summary": html.escape(summary)}
-    template = package.joinpath("_view/page.html").read_text(encoding="utf-8")
+    template = package.joinpath("draw/page_files/page.html").read_text(encoding="utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
 
 

@@ -11,8 +11,8 @@ import pytest
 import shapely
 
 from probe2road.errors import CRSError, InputError, OptionError, OutputError
-from probe2road.export import WRITABLE, read_graph, write_graph
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.io.graph_files import WRITABLE, read_graph, write_graph
 from probe2road.io.graph_networkx import from_networkx, to_networkx
 
 UTM = "EPSG:32616"

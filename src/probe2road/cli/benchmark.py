@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from probe2road.progress_bar import progress_bar
+from probe2road.run.progress import progress_bar
 
 __all__ = ["benchmark"]
 

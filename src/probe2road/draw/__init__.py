@@ -1,0 +1,1 @@
+"""Graphs over traces for the eye: pictures, the stages of a run, the HTML page."""

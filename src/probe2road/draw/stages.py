@@ -1,0 +1,44 @@
+"""The stages of a run in one picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from probe2road.draw.picture import Stage, write_filmstrip
+from probe2road.fleet import Fleet
+from probe2road.io.graph_files import read_graph
+from probe2road.raster.counts import rasterize
+from probe2road.raster.grid import read_raster
+
+__all__ = ["draw_stages"]
+
+
+def draw_stages(folder: str | Path, fleet: Fleet, path: str | Path) -> None:
+    """Draw what the stages of a run left in its workspace, side by side, as a PNG.
+
+    Parameters
+    ----------
+    folder
+        Workspace of a finished `build`.
+    fleet
+        The fleet it was built from.
+    path
+        The picture.
+
+    Raises
+    ------
+    InputError
+        If a stage is missing.
+    """
+    folder = Path(folder)
+    probability, grid = read_raster(folder / "1-probability.tif")
+    skeleton, _ = read_raster(folder / "3-skeleton.tif")
+    traces = rasterize(fleet, grid)[0]
+    panels = [
+        Stage("Traces", traces, grid, f"{fleet.n_traces:,} traces, {len(fleet.traces):,} fixes"),
+        Stage("Probability", probability[0], grid, "of a centreline"),
+        Stage("Skeleton", skeleton[0].astype(bool), grid, f"{int(skeleton.sum()):,} pixels"),
+        Stage("Graph", read_graph(folder / "4-vectorized.gpkg")),
+        Stage("Roads", read_graph(folder / "7-roads.gpkg")),
+    ]
+    write_filmstrip(panels, path)
