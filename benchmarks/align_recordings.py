@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from probe2road.align import align
+from probe2road.alignment.align import align
 from probe2road.crs import WGS84, transform
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 
 GPS_EPOCH = pd.Timestamp("1980-01-06", tz="UTC")
 

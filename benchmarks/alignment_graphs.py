@@ -26,7 +26,7 @@ from probe2road.alignment.tiling import moved_fleet
 from probe2road.benchmark.prepare import check_dataset
 from probe2road.benchmark.recording import Recording
 from probe2road.benchmark.reference import labelled_reference
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.io.fleet_reader import read_fleet_files
 
 METRICS = ("geo", "itopo")

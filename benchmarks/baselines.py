@@ -22,7 +22,7 @@ from probe2road.baselines.deepmg.recipe import DeepMGOptions, build_deepmg
 from probe2road.baselines.kde import build_kde
 from probe2road.comparison.measured import measure
 from probe2road.draw.picture import draw_graph
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.metrics.evaluate import MetricOptions
 from probe2road.recipe import BuildOptions

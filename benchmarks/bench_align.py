@@ -17,7 +17,7 @@ import resource
 import time
 from dataclasses import astuple, dataclass
 
-from probe2road.align import align
+from probe2road.alignment.align import align
 from probe2road.simulate.fleet_simulation import simulate
 from probe2road.simulate.network import network_from_sections
 

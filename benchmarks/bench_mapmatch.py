@@ -17,7 +17,7 @@ import pandas as pd
 from bench_metrics import street_lines
 from numpy.typing import NDArray
 
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.matching.match import MatchOptions, match
 

@@ -20,7 +20,7 @@ import pandas as pd
 from pyproj import CRS
 
 from probe2road.crs import WGS84, transform
-from probe2road.fleet import fleet_from_tables
+from probe2road.fleet.contract import fleet_from_tables
 from probe2road.io.fleet_reader import read_fleet
 
 UTM = CRS.from_epsg(32616)

@@ -21,7 +21,7 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road import build, evaluate, read_fleet, read_graph
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import edge_lines, stations_along
 from probe2road.matching.match import match

@@ -28,7 +28,7 @@ from probe2road.benchmark.recording import Recording
 from probe2road.benchmark.reference import labelled_reference
 from probe2road.benchmark.tiles import split_area
 from probe2road.crs import WGS84, transform
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_writer import points_path
 from probe2road.metrics.normalise import clip_graph

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from probe2road.fleet import Fleet
-from probe2road.fleet_tables import empty_points
+from probe2road.fleet.contract import Fleet
+from probe2road.fleet.tables import empty_points
 from probe2road.graph.clean import clean_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.splitting import split_edges

@@ -38,7 +38,7 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.crs import WGS84, local_crs, transform
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.matching.match import Matches, MatchOptions, match

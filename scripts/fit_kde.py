@@ -26,7 +26,7 @@ from probe2road.benchmark.prepare import check_dataset, read_tiles
 from probe2road.benchmark.recording import Recording
 from probe2road.benchmark.reference import labelled_reference
 from probe2road.benchmark.tiles import split_area
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.metrics.normalise import clip_graph
 
 logger = logging.getLogger("fit_kde")

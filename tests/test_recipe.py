@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from probe2road.errors import InputError, OptionError, OutputError
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.clean import CleanOptions
 from probe2road.graph.roadgraph import graph_from_lines

@@ -13,7 +13,7 @@ __version__ = "0.1.0.dev0"
 if TYPE_CHECKING:
     from probe2road.draw.page import write_view
     from probe2road.errors import Probe2RoadError
-    from probe2road.fleet import Fleet, TraceGaps, fleet_from_tables
+    from probe2road.fleet.contract import Fleet, TraceGaps, fleet_from_tables
     from probe2road.graph.check import check_graph
     from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
     from probe2road.io.describe import describe_fleet
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 _HOME = {
     "Probe2RoadError": "errors",
-    "Fleet": "fleet",
-    "TraceGaps": "fleet",
-    "fleet_from_tables": "fleet",
+    "Fleet": "fleet.contract",
+    "TraceGaps": "fleet.contract",
+    "fleet_from_tables": "fleet.contract",
     "read_fleet": "io.fleet_reader",
     "write_fleet": "io.fleet_writer",
     "describe_fleet": "io.describe",

@@ -10,7 +10,7 @@ import pandas as pd
 
 from probe2road.draw.page import write_view
 from probe2road.draw.stages import draw_stages
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.io.atomic import make_folder
 from probe2road.io.fleet_reader import read_fleet_files
 from probe2road.io.fleet_writer import write_fleet

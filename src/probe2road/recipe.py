@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet, TraceGaps
+from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster.counts import fleet_grid, rasterize_windows

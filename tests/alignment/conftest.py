@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 
 CRS = "EPSG:32616"
 ORIGIN = np.array([446_000.0, 4_636_000.0])

@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe2road.align import AlignOptions, add_drives, align
+from probe2road.alignment.align import AlignOptions, add_drives, align
 from probe2road.cli.main import main
 from probe2road.errors import InputError, MissingExtraError, OptionError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import write_fleet
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from probe2road.align import AlignOptions
+from probe2road.alignment.align import AlignOptions
 from probe2road.alignment.anchoring import anchored
 from probe2road.alignment.keyframes import Keyframes, keyframes
 from probe2road.alignment.profiles import Places

@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from probe2road.align import align
+from probe2road.alignment.align import align
 from probe2road.alignment.reckoning import steadying
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 
 CRS = "EPSG:32616"
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from probe2road.align import AlignOptions, align
+from probe2road.alignment.align import AlignOptions, align
 from probe2road.alignment.keyframes import keyframes
 from probe2road.alignment.routes import routes, split_decks
 from probe2road.alignment.spines import OnSpines, Spines

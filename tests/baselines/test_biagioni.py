@@ -14,7 +14,7 @@ from probe2road.baselines.biagioni.recipe import FLEET, SIGMAS, BiagioniOptions,
 from probe2road.baselines.biagioni.street_map import straight_pieces
 from probe2road.baselines.biagioni.traversals import Runs, good_runs, match_pieces, observe_trips
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import graph_from_lines
 from probe2road.matching.network import build_states

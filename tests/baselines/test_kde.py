@@ -14,7 +14,7 @@ from probe2road.baselines.volume import Pillars, count_voxels, dense_pillars, pi
 from probe2road.baselines.volume_graph import graph_from_volume, voxel_links
 from probe2road.baselines.volume_skeleton import thin_volume
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.raster.grid import Grid
 

@@ -22,7 +22,7 @@ from matplotlib.image import imread
 
 from probe2road.draw.page import write_view
 from probe2road.errors import OptionError, OutputError
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 
 EAST, NORTH = 446000.0, 4636000.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from probe2road.draw.picture import Stage, draw_graph, write_filmstrip
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet import fleet_from_tables
+from probe2road.fleet.contract import fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.raster.grid import Grid
 

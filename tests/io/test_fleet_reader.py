@@ -15,7 +15,7 @@ import pytest
 
 from probe2road.crs import WGS84, transform
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet, fleet_from_tables, trace_breaks
+from probe2road.fleet.contract import Fleet, fleet_from_tables, trace_breaks
 from probe2road.io.fleet_reader import read_fleet
 
 UTM = "EPSG:32616"

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from probe2road.errors import OutputError
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.io.describe import describe_fleet
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import write_fleet

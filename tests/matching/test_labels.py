@@ -12,7 +12,7 @@ import shapely
 from scipy import ndimage
 
 from probe2road.errors import CRSError, InputError, MissingExtraError, OptionError
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.matching import osrm as osrm_module

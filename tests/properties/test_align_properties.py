@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from probe2road.align import add_drives, align
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.alignment.align import add_drives, align
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 
 pytest.importorskip("gtsam", reason="alignment needs the extra 'align'")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from hypothesis import given, settings
 
-from probe2road.fleet import fleet_from_tables, trace_breaks
+from probe2road.fleet.contract import fleet_from_tables, trace_breaks
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import write_fleet
 from probe2road.io.wkb import point_coordinates

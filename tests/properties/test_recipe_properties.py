@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from probe2road.crs import parse_crs, transform
-from probe2road.fleet import fleet_from_tables
+from probe2road.fleet.contract import fleet_from_tables
 from probe2road.recipe import BuildOptions, build
 from probe2road.segmentation.density import DensityOptions
 

@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 
 from probe2road.errors import CRSError, InputError
-from probe2road.fleet import Fleet, TraceGaps, fleet_from_tables
+from probe2road.fleet.contract import Fleet, TraceGaps, fleet_from_tables
 from probe2road.raster.counts import fleet_grid, rasterize, rasterize_windows
 from probe2road.raster.grid import Grid
 

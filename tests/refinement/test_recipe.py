@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.refinement.gaps.fill import GapOptions

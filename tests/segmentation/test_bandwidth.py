@@ -2,7 +2,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.raster.counts import fleet_grid
 from probe2road.segmentation.bandwidth import estimate_bandwidth, lateral_spread
 

@@ -4,7 +4,7 @@ import pytest
 from scipy import ndimage
 
 from probe2road.errors import OptionError
-from probe2road.fleet import fleet_from_tables
+from probe2road.fleet.contract import fleet_from_tables
 from probe2road.raster.counts import fleet_grid, rasterize, rasterize_windows
 from probe2road.raster.grid import Grid
 from probe2road.segmentation.density import DensityOptions, density_probability, density_segmenter

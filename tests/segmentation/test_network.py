@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet import fleet_from_tables
+from probe2road.fleet.contract import fleet_from_tables
 from probe2road.raster.counts import fleet_grid, rasterize
 from probe2road.raster.grid import Grid
 from probe2road.recipe import BuildOptions, build

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from probe2road.errors import OptionError
-from probe2road.fleet import fleet_from_tables, trace_breaks
+from probe2road.fleet.contract import fleet_from_tables, trace_breaks
 from probe2road.graph.check import check_graph
 from probe2road.simulate.fleet_simulation import simulate, simulate_chunks
 from probe2road.simulate.network import network_from_sections

@@ -6,7 +6,7 @@ import pytest
 from probe2road.benchmark.recording import Recording
 from probe2road.benchmark.reference import labelled_reference
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet import fleet_from_tables
+from probe2road.fleet.contract import fleet_from_tables
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path
 from probe2road.io.graph_files import read_graph

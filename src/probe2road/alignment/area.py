@@ -24,7 +24,7 @@ from probe2road.alignment.reckoning import wrapped
 from probe2road.alignment.registration import Chains, Evidence, register
 from probe2road.alignment.routes import route_heights
 from probe2road.alignment.spines import CELL, OnSpines, Spines, find_spines, project
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 
 __all__ = ["AlignedArea", "align_area"]
 

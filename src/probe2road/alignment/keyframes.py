@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.reckoning import fixes_course, reckoned_steps, wrapped
 from probe2road.alignment.screening import rows_of_points
-from probe2road.fleet import POINT_KINDS, Fleet, fix_intervals, trace_breaks
+from probe2road.fleet.contract import POINT_KINDS, Fleet, fix_intervals, trace_breaks
 
 __all__ = [
     "Keyframes",
@@ -115,7 +115,7 @@ def keyframes(fleet: Fleet, options: AlignOptions) -> Keyframes:
     Examples
     --------
     >>> import pandas as pd
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(11), "x": 446e3 + 10.0 * np.arange(11), "y": 4636e3})
     >>> frames = keyframes(fleet_from_tables(table, crs="EPSG:32616"), AlignOptions(keyframe_spacing=50.0))
     >>> frames.distance.tolist(), frames.motion[1].tolist()

@@ -16,7 +16,7 @@ import pandas as pd
 from numba import njit
 from numpy.typing import NDArray
 
-from probe2road.fleet import Fleet, fix_intervals, trace_breaks
+from probe2road.fleet.contract import Fleet, fix_intervals, trace_breaks
 
 __all__ = ["fixes_course", "reckoned_steps", "steadying", "wrapped"]
 
@@ -116,7 +116,7 @@ def steadying(fleet: Fleet) -> NDArray[np.float64]:
 
     Examples
     --------
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(60), "x": 446e3 + 10.0 * np.arange(60), "y": 4636e3})
     >>> table.loc[30, "y"] += 40.0  # a reflection
     >>> fleet = fleet_from_tables(table.assign(heading=90.0, speed=10.0), crs="EPSG:32616")

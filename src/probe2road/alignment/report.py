@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from probe2road.alignment.tiling import Moves
 from probe2road.errors import InputError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.io.atomic import atomic_path
 
 __all__ = ["STATUSES", "AlignmentReport", "draw_alignment", "make_report", "write_report"]

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from probe2road.fleet import Fleet, fix_intervals
+from probe2road.fleet.contract import Fleet, fix_intervals
 
 __all__ = ["rows_of_points", "screen_drives"]
 
@@ -46,7 +46,7 @@ def screen_drives(fleet: Fleet) -> NDArray[np.str_]:
 
     Examples
     --------
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> still = pd.DataFrame({"trace_id": 1, "t": range(50), "x": 446e3, "y": 4636e3})
     >>> moving = still.assign(trace_id=2, x=446e3 + 10.0 * np.arange(50))
     >>> screen_drives(fleet_from_tables(pd.concat([still, moving]), crs="EPSG:32616")).tolist()

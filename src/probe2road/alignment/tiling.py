@@ -22,7 +22,7 @@ from probe2road.alignment.area import AlignedArea, align_area
 from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.reckoning import wrapped
 from probe2road.alignment.screening import rows_of_points
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.run.progress import Progress
 from probe2road.run.workers import in_processes
 from probe2road.run.workspace import Workspace

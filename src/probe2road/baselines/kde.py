@@ -14,7 +14,7 @@ from probe2road.baselines.volume import count_voxels, dense_pillars
 from probe2road.baselines.volume_graph import graph_from_volume
 from probe2road.baselines.volume_skeleton import thin_volume
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet, TraceGaps
+from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster.counts import fleet_grid

@@ -19,7 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from probe2road.fleet import Fleet, TraceGaps, trace_breaks
+from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
 from probe2road.raster.grid import Grid, Window
 
 __all__ = ["Pillars", "VoxelCounts", "count_voxels", "dense_pillars", "pillars_from_voxels"]
@@ -103,7 +103,7 @@ def count_voxels(fleet: Fleet, grid: Grid, *, height: float, gaps: TraceGaps | N
     Examples
     --------
     >>> import pandas as pd
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> table = pd.DataFrame({"trace_id": 1, "t": [0, 1], "x": [900.5, 903.5], "y": 0.5, "z": [1.0, 4.0]})
     >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
     >>> counts = count_voxels(fleet, Grid.from_bounds(fleet.bounds, crs=fleet.crs), height=3.0)

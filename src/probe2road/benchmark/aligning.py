@@ -7,7 +7,7 @@ import logging
 import shutil
 from pathlib import Path
 
-from probe2road.align import align
+from probe2road.alignment.align import align
 from probe2road.benchmark.recording import Recording
 from probe2road.errors import InputError
 from probe2road.io.atomic import atomic_path

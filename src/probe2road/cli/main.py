@@ -20,7 +20,7 @@ from probe2road.run.progress import progress_bar
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe2road.fleet import Fleet
+    from probe2road.fleet.contract import Fleet
     from probe2road.segmentation.network import NetworkOptions
 
 __all__ = ["app", "main"]
@@ -149,8 +149,8 @@ def align(
 
     An interrupted run goes on where it stopped when it is started again.
     """
-    from probe2road.align import AlignOptions, add_drives
-    from probe2road.align import align as align_fleet
+    from probe2road.alignment.align import AlignOptions, add_drives
+    from probe2road.alignment.align import align as align_fleet
     from probe2road.alignment.report import draw_alignment, write_report
     from probe2road.io.fleet_reader import read_fleet_files
     from probe2road.io.fleet_writer import write_fleet

@@ -11,7 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.draw.picture import Stage, write_filmstrip
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster.counts import rasterize
 from probe2road.raster.grid import Grid

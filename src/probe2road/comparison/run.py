@@ -61,8 +61,8 @@ def run_benchmark(
     work
         Folder that keeps graphs and scores, from which an interrupted run goes on; ``work`` in the output without it.
     poses
-        ``aligned`` (by `probe2road.align.align`, which runs first where it has to), ``modelled`` (what an alignment
-        would leave), or ``raw``.
+        ``aligned`` (by `probe2road.alignment.align.align`, which runs first where it has to), ``modelled`` (what an
+        alignment would leave), or ``raw``.
     deepmg
         File of DeepMG's weights; without it the method is left out.
     progress

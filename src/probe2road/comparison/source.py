@@ -21,7 +21,7 @@ from probe2road.benchmark.recording import POSES, Recording
 from probe2road.benchmark.reference import labelled_reference
 from probe2road.benchmark.tiles import SPLITS, split_area
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet_files
 from probe2road.io.fleet_writer import write_fleet

@@ -26,7 +26,7 @@ from pyproj import CRS
 
 from probe2road.crs import WGS84, transform
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet, TraceGaps
+from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path
 from probe2road.io.graph_tables import outgoing

@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path
 from probe2road.raster.counts import rasterize

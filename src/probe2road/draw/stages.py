@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from probe2road.draw.picture import Stage, write_filmstrip
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.io.graph_files import read_graph
 from probe2road.raster.counts import rasterize
 from probe2road.raster.grid import read_raster

@@ -15,7 +15,7 @@ import pandas as pd
 from pyproj import CRS
 
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet_tables import (
+from probe2road.fleet.tables import (
     POINT_COLUMNS,
     POINT_KINDS,
     POINT_OPTIONAL_COLUMNS,

@@ -16,7 +16,7 @@ import pyarrow.csv
 from pyproj import CRS
 
 from probe2road.errors import InputError
-from probe2road.fleet_tables import TableOrigin
+from probe2road.fleet.tables import TableOrigin
 from probe2road.io.columns import choose_columns, standard_kinds, times_from_numbers
 from probe2road.io.sources import RawTable, SourceFile
 

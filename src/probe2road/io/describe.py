@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 
 from probe2road.crs import WGS84, transform
-from probe2road.fleet import Fleet, TraceGaps, trace_breaks
-from probe2road.fleet_tables import POINT_KINDS
+from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
+from probe2road.fleet.tables import POINT_KINDS
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.graph_files import READABLE, read_graph
@@ -124,7 +124,7 @@ def describe_fleet(
 
     Examples
     --------
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> table = pd.DataFrame({"trace_id": 1, "t": [0, 1, 2, 60], "x": [446e3, 446009, 446018, 446999], "y": 4636e3})
     >>> figures = describe_fleet(fleet_from_tables(table, crs="EPSG:32616"))
     >>> figures["traces"], figures["step_median"], figures["gaps"], figures["length_km"]

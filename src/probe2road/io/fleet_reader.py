@@ -14,8 +14,8 @@ from pyproj import CRS
 
 from probe2road.crs import WGS84, parse_crs, same_crs
 from probe2road.errors import CRSError, InputError, OptionError
-from probe2road.fleet import Fleet, fleet_from_checked
-from probe2road.fleet_tables import check_points, check_traces
+from probe2road.fleet.contract import Fleet, fleet_from_checked
+from probe2road.fleet.tables import check_points, check_traces
 from probe2road.io.delimited import read_text_table
 from probe2road.io.fleet_writer import points_path
 from probe2road.io.gpx import read_gpx
@@ -67,7 +67,7 @@ def read_fleet(
         CRS of the coordinates in the files. Not needed where the file states it (GeoParquet, GPX) or the
         columns are called longitude and latitude.
     target_crs
-        Metric CRS to work in; see `probe2road.fleet.fleet_from_tables`.
+        Metric CRS to work in; see `probe2road.fleet.contract.fleet_from_tables`.
     bbox
         ``(left, bottom, right, top)`` in the CRS of the files (degrees for longitude and latitude): only fixes
         and points inside are read. In Parquet, row groups outside are skipped.
@@ -85,7 +85,7 @@ def read_fleet(
     ------
     InputError
         Naming file, row and remedy, for everything that is wrong with the files: see
-        `probe2road.fleet.fleet_from_tables` for the faults of tables.
+        `probe2road.fleet.contract.fleet_from_tables` for the faults of tables.
     CRSError
         If there is no CRS, if ``crs`` contradicts a file, or if the files have several.
     OptionError

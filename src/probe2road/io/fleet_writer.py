@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from probe2road.errors import OutputError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.io.atomic import atomic_path
 from probe2road.io.sources import FORMATS, POINTS_MARK
 
@@ -67,7 +67,7 @@ def write_fleet(fleet: Fleet, path: str | PathLike[str]) -> list[Path]:
     Examples
     --------
     >>> import tempfile
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.io.fleet_reader import read_fleet
     >>> fleet = fleet_from_tables(pd.DataFrame({"trace_id": [7], "x": [446e3], "y": [4636e3]}), crs="EPSG:32616")
     >>> with tempfile.TemporaryDirectory() as folder:

@@ -16,7 +16,7 @@ import pandas as pd
 
 from probe2road.crs import WGS84
 from probe2road.errors import InputError
-from probe2road.fleet_tables import TableOrigin
+from probe2road.fleet.tables import TableOrigin
 from probe2road.io.sources import RawTable, SourceFile
 
 __all__ = ["read_gpx"]

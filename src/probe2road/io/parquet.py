@@ -15,7 +15,7 @@ from pyproj import CRS
 
 from probe2road.crs import parse_crs
 from probe2road.errors import InputError
-from probe2road.fleet_tables import TableOrigin
+from probe2road.fleet.tables import TableOrigin
 from probe2road.io.columns import ColumnChoice, choose_columns, standard_kinds, times_from_numbers
 from probe2road.io.sources import RawTable, SourceFile
 from probe2road.io.wkb import point_coordinates

@@ -11,7 +11,7 @@ import pandas as pd
 from pyproj import CRS
 
 from probe2road.errors import InputError
-from probe2road.fleet_tables import TableOrigin
+from probe2road.fleet.tables import TableOrigin
 
 __all__ = ["FORMATS", "POINTS_MARK", "RawTable", "SourceFile", "find_sources"]
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
 from probe2road.errors import InputError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.match import Matches
 
@@ -210,7 +210,7 @@ def frame(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[Traversals,
 
     Examples
     --------
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.matching.match import match
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")

@@ -15,7 +15,7 @@ import pandas as pd
 
 from probe2road.crs import same_crs
 from probe2road.errors import CRSError, OptionError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.splitting import split_edges
 from probe2road.graph.tables import empty_turns, finish_edges
@@ -89,7 +89,7 @@ def label_reference(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions
 
     Examples
     --------
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> reference = graph_from_lines([[(0, 0), (240, 0)], [(240, 0), (240, 90)]], crs="EPSG:32616")
     >>> there = pd.DataFrame({"t": range(15), "x": np.arange(5.0, 155, 10), "y": 1.0})

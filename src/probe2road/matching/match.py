@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from probe2road.crs import require_metric, same_crs
 from probe2road.errors import CRSError, InputError, OptionError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import TURN_DTYPES
 from probe2road.matching.chains import Paths, match_over_routes
@@ -116,7 +116,7 @@ def match(
 
     Examples
     --------
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 80)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(5), "x": [20.0, 60, 90, 101, 500], "y": [1.0, 0, 2, 40, 500]})
@@ -173,7 +173,7 @@ def turn_counts(matches: Matches, graph: RoadGraph) -> pd.DataFrame:
 
     Examples
     --------
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(4), "x": [130.0, 110, 90, 70], "y": 0.0})

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.matching.candidates import altitude_at, nearest_points, new_scratch
 from probe2road.matching.models import RouteModel
 from probe2road.matching.network import States

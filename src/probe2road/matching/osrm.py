@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from probe2road.crs import WGS84, transform
 from probe2road.errors import InputError, MissingExtraError, OptionError, Probe2RoadError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.direction import driving_direction
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import courses, edge_lines, stations_along

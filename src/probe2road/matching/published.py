@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.matching.candidates import Scratch, nearest_points, new_scratch
 from probe2road.matching.chains import Paths
 from probe2road.matching.models import PublishedModel

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.errors import CRSError, InputError
-from probe2road.fleet import Fleet, TraceGaps, trace_breaks
+from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
 from probe2road.raster.grid import Grid, Window, sparse_zeros
 
 __all__ = [
@@ -83,7 +83,7 @@ def rasterize(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> NDA
     Examples
     --------
     >>> import pandas as pd
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(3), "x": [900.5, 902.5, 904.5], "y": [0.5, 0.5, 2.5]})
     >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
     >>> rasterize(fleet, Grid.from_bounds(fleet.bounds, crs=fleet.crs))[0]
@@ -158,7 +158,7 @@ def count_pixels(
     breaks
         True where no segment leads from the fix before; shape ``(f,)``.
     point_row, point_col, kind
-        Pixels of p points, and their positions in `probe2road.fleet.POINT_KINDS`.
+        Pixels of p points, and their positions in `probe2road.fleet.contract.POINT_KINDS`.
     shape
         ``(rows, cols)`` of the raster.
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from probe2road.crs import same_crs
 from probe2road.errors import CRSError, OptionError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import (
     EdgeLines,
@@ -111,7 +111,7 @@ def refine_centreline(
     --------
     Three traces each way, 3 m apart, on a road that is drawn 2 m too far north:
 
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.matching.match import match
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 2), (400, 2)]], crs="EPSG:32616")

@@ -16,7 +16,7 @@ from scipy.special import betaln
 
 from probe2road.crs import same_crs
 from probe2road.errors import CRSError, OptionError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import FramedFixes, Traversals, edge_lines, frame, robust_sigma
 from probe2road.matching.match import Matches, turn_counts
@@ -104,7 +104,7 @@ def add_evidence(
 
     Examples
     --------
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.matching.match import match
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 80)]], crs="EPSG:32616")
@@ -148,7 +148,7 @@ def drive_numbers(fleet: Fleet, *, pause: float = 300.0) -> NDArray[np.int64]:
 
     Examples
     --------
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> times = pd.to_datetime(["08:00", "08:10", "08:12", "08:20", "09:00", "09:10"], format="%H:%M", utc=True)
     >>> table = pd.DataFrame({"trace_id": [1, 1, 2, 2, 3, 3], "vehicle_id": "A", "t": times, "x": 500.0, "y": 0.0})
     >>> fleet = fleet_from_tables(table.assign(x=table.index + 500.0), crs="EPSG:32616", target_crs="EPSG:32616")

@@ -19,7 +19,7 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import (
     FramedFixes,
@@ -88,7 +88,7 @@ def with_heights(
     Examples
     --------
     >>> from probe2road.matching.frame import frame
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.matching.match import match
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616")

@@ -21,7 +21,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.errors import OutputError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path, make_folder
 from probe2road.io.graph_files import read_graph, write_graph

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from probe2road.fleet import Fleet, TraceGaps, trace_breaks
+from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
 from probe2road.raster.grid import Grid
 
 __all__ = ["estimate_bandwidth", "lateral_spread"]
@@ -70,7 +70,7 @@ def lateral_spread(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -
     Examples
     --------
     >>> import pandas as pd
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.raster.counts import fleet_grid
     >>> drives = [
     ...     pd.DataFrame({"trace_id": k, "t": range(50), "x": 446000 + 9.0 * np.arange(50), "y": 4636000 + k / 10})

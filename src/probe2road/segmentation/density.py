@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet, TraceGaps
+from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.raster.grid import Grid
 from probe2road.segmentation.bandwidth import estimate_bandwidth
 from probe2road.segmentation.segmenter import Segmenter

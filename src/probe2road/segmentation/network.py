@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.raster.counts import CHANNELS
 from probe2road.raster.grid import Grid
 from probe2road.segmentation.runtime import DEVICES, load_network, run_network

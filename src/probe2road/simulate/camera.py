@@ -24,7 +24,7 @@ from probe2road.errors import OptionError
 
 __all__ = ["CameraModel", "Detections", "FeatureIndex", "feature_index", "see"]
 
-LANE_MARKING, ROAD_BOUNDARY = 0, 1  # codes of the kinds, in the order of probe2road.fleet.POINT_KINDS
+LANE_MARKING, ROAD_BOUNDARY = 0, 1  # codes of the kinds, in the order of probe2road.fleet.contract.POINT_KINDS
 
 _CELL = 20.0  # m, side of a cell of the index
 _LONGEST_PIECE = 3.1  # m

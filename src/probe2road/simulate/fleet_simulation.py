@@ -18,7 +18,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.errors import OptionError
-from probe2road.fleet import POINT_KINDS, Fleet
+from probe2road.fleet.contract import POINT_KINDS, Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.run.workers import in_processes
 from probe2road.simulate.camera import ROAD_BOUNDARY, Detections, FeatureIndex, feature_index, see
@@ -50,7 +50,7 @@ _WORLD, _DRIVE, _VEHICLE = 0, 1, 2  # first key of the random streams
 class FleetChunk:
     """Some consecutive drives: raw fleet data, and the truth behind it."""
 
-    traces: pd.DataFrame  # as in `probe2road.fleet.Fleet`
+    traces: pd.DataFrame  # as in `probe2road.fleet.contract.Fleet`
     points: pd.DataFrame  # the same
     poses: pd.DataFrame  # one row for each row of traces: see `SimulatedFleet`
     routes: pd.DataFrame  # one row for each section driven: see `SimulatedFleet`

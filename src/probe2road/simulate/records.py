@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from probe2road.fleet import POINT_KINDS
+from probe2road.fleet.contract import POINT_KINDS
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.simulate.camera import Detections
 from probe2road.simulate.routes import LinkGraph, route_moves

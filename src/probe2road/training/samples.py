@@ -24,8 +24,8 @@ __all__ = ["Sample", "SampleOptions", "Vectors", "draw_sample", "sample_vectors"
 _ROTATIONS = ("none", "right_angles", "any")
 # Places to columns and rows, turned by no, one, two and three right angles.
 _TURNS = np.array([[[1, 0], [0, -1]], [[0, 1], [1, 0]], [[-1, 0], [0, 1]], [[0, -1], [-1, 0]]], np.float64)
-_SEGMENT = 150.0  # m; a longer step is no segment (`probe2road.fleet.TraceGaps.max_step`)
-_LATE = 5.0  # s; a longer interval is a gap (`probe2road.fleet.TraceGaps.max_interval`)
+_SEGMENT = 150.0  # m; a longer step is no segment (`probe2road.fleet.contract.TraceGaps.max_step`)
+_LATE = 5.0  # s; a longer interval is a gap (`probe2road.fleet.contract.TraceGaps.max_interval`)
 _LATE_INTERVALS = 3.0  # or as many times the interval between fixes, where that is more
 _FAST = 40.0  # m/s; with sparse fixes a segment may be as long as what is driven so fast in one interval
 

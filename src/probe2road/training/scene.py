@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from probe2road.crs import same_crs
 from probe2road.errors import CRSError, InputError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path
 
@@ -96,7 +96,7 @@ def make_scene(
 
     Examples
     --------
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> table = pd.DataFrame({"trace_id": 7, "t": range(9), "x": np.arange(9.0) * 25, "y": 0.0})
     >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")

@@ -9,7 +9,7 @@ import pytest
 from probe2road.baselines.deepmg.features import PLANES, FeatureOptions, Steps, extract_features, thin_traces
 from probe2road.baselines.deepmg.variants import find_variant
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.raster.grid import Grid
 
 CRS = "EPSG:32616"

@@ -12,7 +12,7 @@ from probe2road.baselines.deepmg.features import FeatureOptions, Steps, thin_tra
 from probe2road.baselines.deepmg.pruning import PruneOptions, prune_graph
 from probe2road.baselines.deepmg.traversals import MatcherOptions, count_traversals
 from probe2road.errors import OptionError
-from probe2road.fleet import fleet_from_tables
+from probe2road.fleet.contract import fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 
 CRS = "EPSG:32616"

@@ -18,7 +18,7 @@ from probe2road.baselines.deepmg.t2rnet import T2RNet, soft_dice_loss, t2rnet_lo
 from probe2road.baselines.deepmg.tiles import TileSet, open_tiles, read_batch, tile_grids, write_tiles  # noqa: E402
 from probe2road.baselines.deepmg.training import TrainOptions, train  # noqa: E402
 from probe2road.errors import InputError, OptionError  # noqa: E402
-from probe2road.fleet import Fleet, fleet_from_tables  # noqa: E402
+from probe2road.fleet.contract import Fleet, fleet_from_tables  # noqa: E402
 from probe2road.graph.check import check_graph  # noqa: E402
 from probe2road.graph.roadgraph import graph_from_lines  # noqa: E402
 from probe2road.raster.counts import fleet_grid  # noqa: E402

@@ -7,7 +7,7 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.matching.match import match

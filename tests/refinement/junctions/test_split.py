@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet import fleet_from_tables
+from probe2road.fleet.contract import fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.matching.match import match

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from probe2road.fleet import Fleet, TraceGaps, trace_breaks
+from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
 from probe2road.raster.grid import Grid, Window
 
 __all__ = ["LEVELS", "blur", "blur_kernel", "close_with_disk", "level_ranks", "trip_lines"]
@@ -55,7 +55,7 @@ def trip_lines(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> ND
     Three passes of two trips along the middle of a row of pixels:
 
     >>> import pandas as pd
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> x = [901.5, 904.5, 901.5, 901.5, 904.5]
     >>> table = pd.DataFrame({"trace_id": [1, 1, 1, 2, 2], "t": range(5), "x": x, "y": 1.5})
     >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")

@@ -20,7 +20,7 @@ from probe2road.baselines.biagioni.pruning import prune_segments
 from probe2road.baselines.biagioni.street_map import initial_map, straight_pieces
 from probe2road.baselines.biagioni.traversals import Observations, Runs, good_runs, match_pieces, observe_trips
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet, TraceGaps
+from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.models import PublishedModel
 from probe2road.raster.counts import fleet_grid

@@ -19,7 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.baselines.biagioni.street_map import Pieces
-from probe2road.fleet import Fleet, TraceGaps, trace_breaks
+from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
 from probe2road.matching.models import PublishedModel
 from probe2road.matching.network import build_states
 from probe2road.matching.published import match_published
@@ -75,7 +75,7 @@ def observe_trips(fleet: Fleet, *, step: float, gaps: TraceGaps | None = None) -
 
     Examples
     --------
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> table = pd.DataFrame({"trace_id": 1, "t": [0, 3, 4], "x": [900.0, 925.0, 930.0], "y": 900.0})
     >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
     >>> found = observe_trips(fleet, step=10.0)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from probe2road.baselines.deepmg.variants import Variant
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet, TraceGaps, trace_breaks
+from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
 from probe2road.raster.grid import Grid
 
 __all__ = ["COARSE_CELLS", "PLANES", "FeatureOptions", "Steps", "extract_features", "thin_traces"]
@@ -98,7 +98,7 @@ def thin_traces(fleet: Fleet, options: FeatureOptions | None = None, *, gaps: Tr
     Examples
     --------
     >>> import pandas as pd
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(6), "x": [0.0, 4, 11, 15, 22, 400], "y": 0.0})
     >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
     >>> steps = thin_traces(fleet)

@@ -18,7 +18,7 @@ from probe2road.baselines.deepmg.pruning import PruneOptions, prune_graph
 from probe2road.baselines.deepmg.traversals import MatcherOptions, count_traversals
 from probe2road.baselines.deepmg.variants import find_variant
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet import Fleet, TraceGaps
+from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster.counts import fleet_grid
 from probe2road.raster.grid import Grid

@@ -100,7 +100,7 @@ def count_traversals(
     --------
     >>> import pandas as pd
     >>> from probe2road.baselines.deepmg.features import thin_traces
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(200, 0), (100, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(5), "x": [20.0, 60, 90, 130, 170], "y": [1.0, 0, 2, 0, 1]})

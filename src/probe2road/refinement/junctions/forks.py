@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from shapely.ops import substring
 
 from probe2road.errors import OptionError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import finish_edges
 from probe2road.graph.topology import directions_away, end_nodes
@@ -116,7 +116,7 @@ def move_forks(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: For
     --------
     A ramp that leaves at 100 m, traced from a mask that saw it from 150 m on:
 
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.matching.match import match
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> lines = [[(0, 0), (150, 0)], [(150, 0), (160, 0), (300, 0)], [(150, 0), (160, -6), (300, -20)]]

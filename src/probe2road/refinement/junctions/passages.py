@@ -20,7 +20,7 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError
-from probe2road.fleet import Fleet
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.topology import end_nodes
 from probe2road.matching.match import Matches
@@ -124,7 +124,7 @@ def passing_positions(fleet: Fleet, matches: Matches, graph: RoadGraph) -> pd.Da
 
     Examples
     --------
-    >>> from probe2road.fleet import fleet_from_tables
+    >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.matching.match import match
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")

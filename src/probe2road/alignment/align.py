@@ -19,7 +19,7 @@ from probe2road.alignment.report import AlignmentReport, make_report
 from probe2road.alignment.screening import screen_drives
 from probe2road.alignment.tiling import align_tiles, find_tiles, moved_fleet
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet import POINT_KINDS, Fleet
+from probe2road.fleet.contract import POINT_KINDS, Fleet
 from probe2road.run.progress import Progress
 from probe2road.run.workspace import open_workspace
 

@@ -13,7 +13,7 @@ from pyproj import CRS
 
 from probe2road.crs import WGS84, is_true_to_scale, local_crs, parse_crs, require_metric, transform, turn_headings
 from probe2road.errors import CRSError, InputError, OptionError
-from probe2road.fleet_tables import (
+from probe2road.fleet.tables import (
     POINT_KINDS,
     check_points,
     check_traces,

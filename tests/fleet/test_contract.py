@@ -8,7 +8,7 @@ import pytest
 from pyproj import CRS
 
 from probe2road.errors import CRSError, InputError, OptionError
-from probe2road.fleet import TraceGaps, fleet_from_tables, trace_breaks
+from probe2road.fleet.contract import TraceGaps, fleet_from_tables, trace_breaks
 
 UTM = "EPSG:32616"
 

@@ -1,0 +1,1 @@
+"""Fleet data: what every stage may assume about drives."""
