@@ -35,7 +35,7 @@ from probe2road.benchmark.recording import Recording
 from probe2road.fleet.contract import Fleet
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path
-from probe2road.simulate.fleet_simulation import simulate
+from probe2road.simulation.fleet_simulation import simulate
 
 HALF_LANE = 1.75  # m
 HALF_DECK = 2.5  # m

@@ -18,8 +18,8 @@ import time
 from dataclasses import astuple, dataclass
 
 from probe2road.alignment.align import align
-from probe2road.simulate.fleet_simulation import simulate
-from probe2road.simulate.network import network_from_sections
+from probe2road.simulation.fleet_simulation import simulate
+from probe2road.simulation.networks.network import network_from_sections
 
 DRIVES_A_ROAD = 25
 LENGTH, APART = 2000.0, 400.0  # m

@@ -18,9 +18,9 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from probe2road.simulate.fleet_simulation import simulate_chunks
-from probe2road.simulate.osm import read_network
-from probe2road.simulate.presets import PRESETS
+from probe2road.simulation.fleet_simulation import simulate_chunks
+from probe2road.simulation.networks.osm import read_network
+from probe2road.simulation.presets import PRESETS
 
 
 def write(writers: dict[str, pq.ParquetWriter], name: str, table: pd.DataFrame, folder: Path) -> None:

@@ -28,10 +28,10 @@ from probe2road.matching.match import match
 from probe2road.recipe import BuildOptions
 from probe2road.refinement.centreline import CentrelineOptions, refine_centreline
 from probe2road.refinement.recipe import RefineOptions
-from probe2road.simulate.fleet_simulation import simulate
-from probe2road.simulate.generate import generate_interchange, generate_town
-from probe2road.simulate.network import RoadNetwork
-from probe2road.simulate.osm import read_network
+from probe2road.simulation.drawn.generate import generate_interchange, generate_town
+from probe2road.simulation.fleet_simulation import simulate
+from probe2road.simulation.networks.network import RoadNetwork
+from probe2road.simulation.networks.osm import read_network
 
 CASES = ("cloverleaf", "diamond", "trumpet", "regular town", "irregular town", "tokyo_shibuya")
 PRESETS = ("mixed", "phone")

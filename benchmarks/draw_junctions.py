@@ -22,9 +22,9 @@ from probe2road.recipe import BuildOptions, build
 from probe2road.refinement.gaps.fill import fill_gaps, gap_weights, prune_gaps
 from probe2road.refinement.junctions.passages import passing_positions
 from probe2road.refinement.junctions.split import split_false_junctions
-from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
-from probe2road.simulate.generate import generate_interchange
-from probe2road.simulate.presets import find_preset
+from probe2road.simulation.drawn.generate import generate_interchange
+from probe2road.simulation.fleet_simulation import SimulatedFleet, simulate
+from probe2road.simulation.presets import find_preset
 
 PANELS: dict[str, tuple[str, float | None, float]] = {  # kind, angle, half the width shown in m
     "cloverleaf": ("cloverleaf", None, 140.0),

@@ -21,10 +21,10 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import edge_lines, stations_along
 from probe2road.matching.match import match
 from probe2road.refinement.evidence import add_evidence
-from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
-from probe2road.simulate.generate import generate_interchange, generate_town
-from probe2road.simulate.network import RoadNetwork
-from probe2road.simulate.osm import read_network
+from probe2road.simulation.drawn.generate import generate_interchange, generate_town
+from probe2road.simulation.fleet_simulation import SimulatedFleet, simulate
+from probe2road.simulation.networks.network import RoadNetwork
+from probe2road.simulation.networks.osm import read_network
 
 CASES = ("cloverleaf", "stack", "irregular town", "tokyo_shibuya")
 PRESETS = ("mixed", "phone")

@@ -20,9 +20,9 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.match import match
 from probe2road.recipe import BuildOptions, build
 from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, gap_weights, prune_gaps
-from probe2road.simulate.fleet_simulation import simulate
-from probe2road.simulate.generate import INTERCHANGES, generate_interchange
-from probe2road.simulate.presets import find_preset
+from probe2road.simulation.drawn.generate import INTERCHANGES, generate_interchange
+from probe2road.simulation.fleet_simulation import simulate
+from probe2road.simulation.presets import find_preset
 
 OPTIONS = {"paper's rules": GapOptions(beside=0.0), "and edges beside": GapOptions()}
 _NEAR = 12.0  # m from the end of a link to a road it may lie on

@@ -31,13 +31,13 @@ from probe2road.recipe import BuildOptions, build
 from probe2road.refinement.gaps.fill import fill_gaps, gap_weights, prune_gaps
 from probe2road.refinement.junctions.passages import passing_positions
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
-from probe2road.simulate.crossings import find_crossings
-from probe2road.simulate.fleet_simulation import FleetWorld, fleet_world, simulate_drive
-from probe2road.simulate.generate import generate_interchange, generate_town
-from probe2road.simulate.network import RoadNetwork
-from probe2road.simulate.presets import find_preset
-from probe2road.simulate.records import DriveLabels, drive_tables
-from probe2road.simulate.routes import LinkGraph, draw_route
+from probe2road.simulation.drawn.generate import generate_interchange, generate_town
+from probe2road.simulation.driving.routes import LinkGraph, draw_route
+from probe2road.simulation.fleet_simulation import FleetWorld, fleet_world, simulate_drive
+from probe2road.simulation.networks.crossings import find_crossings
+from probe2road.simulation.networks.network import RoadNetwork
+from probe2road.simulation.presets import find_preset
+from probe2road.simulation.records import DriveLabels, drive_tables
 
 KINDS: Mapping[str, Mapping[str, float | str]] = {
     "diamond": {"kind": "diamond"},

@@ -25,10 +25,10 @@ from probe2road.errors import MissingExtraError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.labels import LabelOptions, cut_reference, label_reference
 from probe2road.matching.osrm import find_osrm
-from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
-from probe2road.simulate.generate import generate_interchange
-from probe2road.simulate.network import RoadNetwork
-from probe2road.simulate.osm import read_network
+from probe2road.simulation.drawn.generate import generate_interchange
+from probe2road.simulation.fleet_simulation import SimulatedFleet, simulate
+from probe2road.simulation.networks.network import RoadNetwork
+from probe2road.simulation.networks.osm import read_network
 
 # Drives: few enough that many roads are driven about four times, where the count decides.
 DRIVES: Mapping[str, int] = {"cloverleaf": 25, "tokyo_shibuya": 120}

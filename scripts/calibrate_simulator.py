@@ -23,12 +23,18 @@ import shapely
 from numpy.typing import NDArray
 from shapely.strtree import STRtree
 
-from probe2road.simulate.features import FEATURE_STYLES
-from probe2road.simulate.fleet_simulation import SimulatedFleet, fleet_world, simulate, simulate_drive, visible_features
-from probe2road.simulate.network import RoadNetwork, network_from_sections
-from probe2road.simulate.osm import read_network
-from probe2road.simulate.presets import PRESETS, RecordingModel, find_preset
-from probe2road.simulate.speeds import DriverModel, lane_wander
+from probe2road.simulation.driving.speeds import DriverModel, lane_wander
+from probe2road.simulation.fleet_simulation import (
+    SimulatedFleet,
+    fleet_world,
+    simulate,
+    simulate_drive,
+    visible_features,
+)
+from probe2road.simulation.lanes.features import FEATURE_STYLES
+from probe2road.simulation.networks.network import RoadNetwork, network_from_sections
+from probe2road.simulation.networks.osm import read_network
+from probe2road.simulation.presets import PRESETS, RecordingModel, find_preset
 
 logger = logging.getLogger("calibrate_simulator")
 

@@ -16,9 +16,9 @@ import numpy as np
 import shapely
 
 from probe2road.crs import WGS84, transform
-from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
-from probe2road.simulate.osm import read_network
-from probe2road.simulate.presets import PRESETS
+from probe2road.simulation.fleet_simulation import SimulatedFleet, simulate
+from probe2road.simulation.networks.osm import read_network
+from probe2road.simulation.presets import PRESETS
 
 COLOURS = {"lane_marking": "limegreen", "road_boundary": "red"}
 

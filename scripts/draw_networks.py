@@ -15,9 +15,9 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection
 from PIL import Image
 
-from probe2road.simulate.features import road_features
-from probe2road.simulate.generate import INTERCHANGES, generate_corridor, generate_interchange, generate_town
-from probe2road.simulate.network import RoadNetwork
+from probe2road.simulation.drawn.generate import INTERCHANGES, generate_corridor, generate_interchange, generate_town
+from probe2road.simulation.lanes.features import road_features
+from probe2road.simulation.networks.network import RoadNetwork
 
 SEED = 3
 Window = tuple[float, float, float]  # centre and half the side, m

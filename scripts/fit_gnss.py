@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.optimize import differential_evolution
 
-from probe2road.simulate.gnss import GnssModel, gnss_errors
-from probe2road.simulate.presets import PRESETS
+from probe2road.simulation.presets import PRESETS
+from probe2road.simulation.sensors.gnss import GnssModel, gnss_errors
 
 logger = logging.getLogger("fit_gnss")
 

@@ -17,8 +17,8 @@ from probe2road.io.fleet_writer import write_fleet
 from probe2road.io.graph_files import write_graph
 from probe2road.metrics import evaluate
 from probe2road.recipe import Progress, build
-from probe2road.simulate.fleet_simulation import SimulatedFleet, simulate
-from probe2road.simulate.generate import generate_interchange
+from probe2road.simulation.drawn.generate import generate_interchange
+from probe2road.simulation.fleet_simulation import SimulatedFleet, simulate
 
 __all__ = ["demo_fleet", "run_demo"]
 

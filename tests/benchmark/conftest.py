@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from probe2road.simulate.network import network_from_sections
+from probe2road.simulation.networks.network import network_from_sections
 
 DATA = Path(os.environ.get("PROBE2ROAD_DATA", Path(__file__).parents[3] / "shared" / "data"))
 

@@ -18,7 +18,7 @@ from probe2road.benchmark.tiles import split_tiles
 from probe2road.errors import InputError, OptionError
 from probe2road.graph.check import check_graph
 from probe2road.io.graph_files import read_graph
-from probe2road.simulate.network import check_network
+from probe2road.simulation.networks.network import check_network
 
 ROADS = """<osm version="0.6">
 <node id="1" lat="52.0" lon="9.0"/><node id="2" lat="52.0" lon="9.3"/>

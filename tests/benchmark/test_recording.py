@@ -13,8 +13,8 @@ from probe2road.errors import OptionError, OutputError
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path
 from probe2road.io.graph_files import read_graph, write_graph
-from probe2road.simulate.fleet_simulation import simulate, simulate_chunks
-from probe2road.simulate.network import network_from_sections
+from probe2road.simulation.fleet_simulation import simulate, simulate_chunks
+from probe2road.simulation.networks.network import network_from_sections
 
 ALIGNED = ResidualModel()
 

@@ -7,8 +7,8 @@ import pytest
 from probe2road.benchmark.residual import ResidualModel, align_drives
 from probe2road.errors import OptionError
 from probe2road.fleet.contract import fleet_from_tables
-from probe2road.simulate.fleet_simulation import simulate
-from probe2road.simulate.network import network_from_sections
+from probe2road.simulation.fleet_simulation import simulate
+from probe2road.simulation.networks.network import network_from_sections
 
 MODEL = ResidualModel()
 

@@ -7,7 +7,7 @@ import shapely
 from probe2road.benchmark.datasets import find_dataset, load_network
 from probe2road.benchmark.tiles import motorway_tiles, split_area, split_tiles
 from probe2road.errors import InputError, OptionError
-from probe2road.simulate.network import network_from_sections
+from probe2road.simulation.networks.network import network_from_sections
 
 COUNTS = {"train": 30, "validation": 6, "test": 5}
 

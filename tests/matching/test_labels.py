@@ -20,8 +20,8 @@ from probe2road.matching.labels import LabelOptions, cut_reference, label_refere
 from probe2road.matching.osrm import OsrmOptions, find_osrm, osrm_network, osrm_segments, osrm_server
 from probe2road.raster.grid import Grid
 from probe2road.raster.lines import label_mask
-from probe2road.simulate.fleet_simulation import simulate
-from probe2road.simulate.generate import generate_interchange
+from probe2road.simulation.drawn.generate import generate_interchange
+from probe2road.simulation.fleet_simulation import simulate
 
 CRS = "EPSG:32616"
 EAST, NORTH = 446000.0, 4636000.0  # OSRM needs coordinates that exist

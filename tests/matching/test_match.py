@@ -352,7 +352,7 @@ def test_options_come_from_tables_and_are_checked() -> None:
 
 
 DATA = (
-    Path(os.environ.get("PROBE2ROAD_DATA", Path(__file__).parents[2] / "shared" / "data")) / "mapmatching" / "kubicka"
+    Path(os.environ.get("PROBE2ROAD_DATA", Path(__file__).parents[3] / "shared" / "data")) / "mapmatching" / "kubicka"
 )
 
 

@@ -15,7 +15,7 @@ from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.metrics import JunctionOptions, comparable, junction_pairs, junctions
 from probe2road.metrics.network import network_from_graph
 from probe2road.metrics.normalise import comparable_networks
-from probe2road.simulate.generate import generate_interchange
+from probe2road.simulation.drawn.generate import generate_interchange
 
 CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]

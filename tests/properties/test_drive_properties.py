@@ -7,10 +7,10 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from probe2road.simulate.network import network_from_sections
-from probe2road.simulate.routes import DemandModel
-from probe2road.simulate.speeds import DriverModel
-from probe2road.simulate.traffic import drive, traffic_world
+from probe2road.simulation.driving.routes import DemandModel
+from probe2road.simulation.driving.speeds import DriverModel
+from probe2road.simulation.driving.traffic import drive, traffic_world
+from probe2road.simulation.networks.network import network_from_sections
 
 DEMAND = DemandModel(min_trip_time=1.0)
 CALM = DriverModel(lane_bias=0.1, wander_sigma=0.1)

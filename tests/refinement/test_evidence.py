@@ -26,8 +26,8 @@ from probe2road.refinement.evidence import (
     oneway_probabilities,
 )
 from probe2road.refinement.heights import HeightOptions
-from probe2road.simulate.fleet_simulation import simulate
-from probe2road.simulate.generate import generate_interchange
+from probe2road.simulation.drawn.generate import generate_interchange
+from probe2road.simulation.fleet_simulation import simulate
 
 CRS = "EPSG:32616"
 TEE = [[(0, 0), (200, 0)], [(200, 0), (400, 0)], [(200, 0), (200, 200)]]

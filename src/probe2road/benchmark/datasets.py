@@ -14,10 +14,10 @@ import numpy as np
 
 from probe2road.benchmark.reference import MAIN_ROADS, PRIMARY_ROADS, main_roads
 from probe2road.errors import InputError, OptionError
-from probe2road.simulate.generate import INTERCHANGES, generate_corridor, generate_interchange, generate_town
-from probe2road.simulate.network import RoadNetwork
-from probe2road.simulate.osm import read_network
-from probe2road.simulate.presets import PRESETS, Preset, find_preset
+from probe2road.simulation.drawn.generate import INTERCHANGES, generate_corridor, generate_interchange, generate_town
+from probe2road.simulation.networks.network import RoadNetwork
+from probe2road.simulation.networks.osm import read_network
+from probe2road.simulation.presets import PRESETS, Preset, find_preset
 
 __all__ = ["DATASETS", "GROUPS", "OSM_NOTICE", "Dataset", "find_dataset", "find_datasets", "load_network"]
 

@@ -30,10 +30,10 @@ from probe2road.io.atomic import atomic_path, make_folder
 from probe2road.io.fleet_writer import ROW_GROUP, bounding_box, point_table, with_geo
 from probe2road.io.graph_files import write_graph
 from probe2road.recipe import Progress
-from probe2road.simulate.fleet_simulation import FleetChunk, simulate_chunks
-from probe2road.simulate.network import RoadNetwork
-from probe2road.simulate.presets import Preset, find_preset
-from probe2road.simulate.records import count_drives
+from probe2road.simulation.fleet_simulation import FleetChunk, simulate_chunks
+from probe2road.simulation.networks.network import RoadNetwork
+from probe2road.simulation.presets import Preset, find_preset
+from probe2road.simulation.records import count_drives
 
 __all__ = ["POSES", "RUN_FILE", "Recording", "record_fleet"]
 
@@ -133,7 +133,7 @@ def record_fleet(
         Created where it does not exist. A recording of another run in it is replaced; one of the same run is taken
         as it is, or completed.
     preset, n_drives, drive_km, seed, workers
-        As in `probe2road.simulate.fleet_simulation.simulate`. The workers have no influence on the result.
+        As in `probe2road.simulation.fleet_simulation.simulate`. The workers have no influence on the result.
     residual
         Also write the fleet data that an alignment with these residual errors would leave. A fleet without camera
         cannot be aligned.
@@ -158,7 +158,7 @@ def record_fleet(
     Examples
     --------
     >>> import tempfile
-    >>> from probe2road.simulate.network import network_from_sections
+    >>> from probe2road.simulation.networks.network import network_from_sections
     >>> network = network_from_sections([[(0, 0), (2000, 0)]], crs="EPSG:32616")
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     recording = record_fleet(network, folder, n_drives=3, seed=7)

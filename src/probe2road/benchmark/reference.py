@@ -10,7 +10,7 @@ import pandas as pd
 
 from probe2road.errors import InputError, OptionError
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.simulate.network import RoadNetwork
+from probe2road.simulation.networks.network import RoadNetwork
 
 __all__ = ["MAIN_ROADS", "PRIMARY_ROADS", "labelled_reference", "main_roads"]
 
@@ -90,7 +90,7 @@ def main_roads(network: RoadNetwork, *, main: Sequence[str] = MAIN_ROADS, reach:
 
     Examples
     --------
-    >>> from probe2road.simulate.network import network_from_sections
+    >>> from probe2road.simulation.networks.network import network_from_sections
     >>> lines = [[(0, 0), (900, 0)], [(900, 0), (900, 400)], [(900, 400), (900, 800)]]
     >>> network = network_from_sections(lines, crs="EPSG:32616", highway=["trunk", "primary", "primary"])
     >>> main_roads(network).sections.index.tolist()

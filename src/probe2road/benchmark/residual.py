@@ -74,7 +74,7 @@ def align_drives(
     Parameters
     ----------
     traces, points
-        Raw fleet data with ``heading``, as `probe2road.simulate.fleet_simulation.simulate` makes it. The points may
+        Raw fleet data with ``heading``, as `probe2road.simulation.fleet_simulation.simulate` makes it. The points may
         be empty.
     poses
         The true poses, row by row those of ``traces``.
@@ -93,8 +93,8 @@ def align_drives(
     --------
     Without residual errors the truth comes out:
 
-    >>> from probe2road.simulate.fleet_simulation import simulate
-    >>> from probe2road.simulate.network import network_from_sections
+    >>> from probe2road.simulation.fleet_simulation import simulate
+    >>> from probe2road.simulation.networks.network import network_from_sections
     >>> made = simulate(network_from_sections([[(0, 0), (2000, 0)]], crs="EPSG:32616"), n_drives=1)
     >>> none = ResidualModel(0.0, 0.0, 1000.0, 0.0, 0.0, 0.0, 0.0)
     >>> traces, points = align_drives(made.fleet.traces, made.fleet.points, made.poses, none, seed=1)

@@ -17,7 +17,7 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OptionError
-from probe2road.simulate.network import RoadNetwork
+from probe2road.simulation.networks.network import RoadNetwork
 
 __all__ = ["SPLITS", "TILE_SIZE", "motorway_tiles", "split_area", "split_tiles"]
 
@@ -51,7 +51,7 @@ def motorway_tiles(network: RoadNetwork, *, size: float = TILE_SIZE) -> gpd.GeoD
 
     Examples
     --------
-    >>> from probe2road.simulate.network import network_from_sections
+    >>> from probe2road.simulation.networks.network import network_from_sections
     >>> network = network_from_sections([[(500, 20), (2200, 20)]], crs="EPSG:32616")
     >>> motorway_tiles(network)["motorway"].to_dict()
     {'0_0': 500.0, '1_0': 1000.0, '2_0': 200.0}
@@ -106,7 +106,7 @@ def split_tiles(
 
     Examples
     --------
-    >>> from probe2road.simulate.network import network_from_sections
+    >>> from probe2road.simulation.networks.network import network_from_sections
     >>> network = network_from_sections([[(0, 20), (20000, 20)]], crs="EPSG:32616")
     >>> counts = {"train": 6, "validation": 4, "test": 4}
     >>> rng = np.random.default_rng(1)

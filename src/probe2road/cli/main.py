@@ -320,8 +320,8 @@ def simulate(
     """
     from probe2road.benchmark.recording import record_fleet
     from probe2road.benchmark.residual import ResidualModel
-    from probe2road.simulate.osm import read_network
-    from probe2road.simulate.presets import find_preset
+    from probe2road.simulation.networks.osm import read_network
+    from probe2road.simulation.presets import find_preset
 
     if (drives is None) == (kilometres is None):
         raise OptionError("the amount must be given once", where="simulate", fix="pass --drives or --kilometres")

@@ -1,0 +1,1 @@
+"""Networks drawn from parameters: corridors, curves, interchanges, towns."""

@@ -1,0 +1,1 @@
+"""Vehicles on a network: routes, lanes, paths, speeds, traffic."""

@@ -1,0 +1,1 @@
+"""Lanes of a network and what is painted and built along them."""

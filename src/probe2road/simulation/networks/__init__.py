@@ -1,0 +1,1 @@
+"""Road networks in 3-D: from OpenStreetMap, with heights, crossings and classes."""

@@ -1,0 +1,1 @@
+"""What vehicles measure: GNSS, odometry, cameras."""
