@@ -30,8 +30,8 @@ import shapely
 
 from probe2road.alignment.align import align
 from probe2road.alignment.report import draw_alignment
-from probe2road.benchmark.datasets import find_dataset, load_network
-from probe2road.benchmark.recording import Recording
+from probe2road.benchmark.sets.datasets import find_dataset, load_network
+from probe2road.benchmark.sets.recording import Recording
 from probe2road.fleet.contract import Fleet
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path

@@ -5,7 +5,8 @@
 Each version of the fleet is built with the default options of `probe2road.build` and scored against the roads that at
 least four drives passed. "true" is the raw fleet moved to its true poses, its points moved rigidly with them: what
 alignment could give at best, with the errors that the camera has of its own. "modelled" is the model of one in the set,
-true poses with the residual errors of `probe2road.benchmark.residual`. Prints one line of a Markdown table for each.
+true poses with the residual errors of `probe2road.benchmark.sets.residual`. Prints one line of a Markdown table for
+each.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ import pyarrow.parquet as pq
 
 from probe2road import build, evaluate, read_graph
 from probe2road.alignment.tiling import moved_fleet
-from probe2road.benchmark.prepare import check_dataset
-from probe2road.benchmark.recording import Recording
-from probe2road.benchmark.reference import labelled_reference
+from probe2road.benchmark.sets.prepare import check_dataset
+from probe2road.benchmark.sets.recording import Recording
+from probe2road.benchmark.sets.reference import labelled_reference
 from probe2road.fleet.contract import Fleet
 from probe2road.io.fleet_reader import read_fleet_files
 

@@ -20,7 +20,7 @@ from probe2road import build, evaluate, read_fleet, read_graph
 from probe2road.baselines.biagioni.recipe import BiagioniOptions, build_biagioni
 from probe2road.baselines.deepmg.recipe import DeepMGOptions, build_deepmg
 from probe2road.baselines.kde import build_kde
-from probe2road.comparison.measured import measure
+from probe2road.benchmark.tables.measured import measure
 from probe2road.draw.picture import draw_graph
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines

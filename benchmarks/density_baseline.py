@@ -22,11 +22,11 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road import build, evaluate, read_fleet, read_graph
-from probe2road.benchmark.datasets import DATASETS
-from probe2road.benchmark.prepare import check_dataset, read_tiles
-from probe2road.benchmark.recording import Recording
-from probe2road.benchmark.reference import labelled_reference
-from probe2road.benchmark.tiles import split_area
+from probe2road.benchmark.sets.datasets import DATASETS
+from probe2road.benchmark.sets.prepare import check_dataset, read_tiles
+from probe2road.benchmark.sets.recording import Recording
+from probe2road.benchmark.sets.reference import labelled_reference
+from probe2road.benchmark.sets.tiles import split_area
 from probe2road.crs import WGS84, transform
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph

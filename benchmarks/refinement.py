@@ -14,8 +14,8 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from probe2road.benchmark.recording import POSES, Recording
-from probe2road.benchmark.reference import labelled_reference
+from probe2road.benchmark.sets.recording import POSES, Recording
+from probe2road.benchmark.sets.reference import labelled_reference
 from probe2road.crs import WGS84, transform
 from probe2road.draw.picture import draw_graph
 from probe2road.fleet.contract import Fleet

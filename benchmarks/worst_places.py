@@ -26,7 +26,7 @@ import matplotlib.pyplot as plt
 from PIL import Image
 
 from probe2road import read_graph
-from probe2road.benchmark.reference import labelled_reference
+from probe2road.benchmark.sets.reference import labelled_reference
 from probe2road.graph.roadgraph import RoadGraph
 
 SPACING, RADIUS = 5.0, 6.0  # m, of points on roads

@@ -18,10 +18,10 @@ from fit_kde import chosen_tiles, within
 
 from probe2road import evaluate, read_fleet, read_graph
 from probe2road.baselines.biagioni.recipe import FLEET, BiagioniOptions, build_biagioni
-from probe2road.benchmark.prepare import check_dataset, read_tiles
-from probe2road.benchmark.recording import Recording
-from probe2road.benchmark.reference import labelled_reference
-from probe2road.benchmark.tiles import split_area
+from probe2road.benchmark.sets.prepare import check_dataset, read_tiles
+from probe2road.benchmark.sets.recording import Recording
+from probe2road.benchmark.sets.reference import labelled_reference
+from probe2road.benchmark.sets.tiles import split_area
 
 logger = logging.getLogger("compare_biagioni")
 

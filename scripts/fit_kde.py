@@ -22,10 +22,10 @@ import numpy as np
 
 from probe2road import evaluate, read_fleet, read_graph
 from probe2road.baselines.kde import KdeOptions, build_kde
-from probe2road.benchmark.prepare import check_dataset, read_tiles
-from probe2road.benchmark.recording import Recording
-from probe2road.benchmark.reference import labelled_reference
-from probe2road.benchmark.tiles import split_area
+from probe2road.benchmark.sets.prepare import check_dataset, read_tiles
+from probe2road.benchmark.sets.recording import Recording
+from probe2road.benchmark.sets.reference import labelled_reference
+from probe2road.benchmark.sets.tiles import split_area
 from probe2road.fleet.contract import Fleet
 from probe2road.metrics.normalise import clip_graph
 

@@ -17,7 +17,7 @@ import geopandas as gpd
 from probe2road.baselines.deepmg.features import FeatureOptions, thin_traces
 from probe2road.baselines.deepmg.tiles import TileSet, open_tiles, tile_grids, write_tiles
 from probe2road.baselines.deepmg.training import TrainOptions, train
-from probe2road.benchmark.reference import labelled_reference
+from probe2road.benchmark.sets.reference import labelled_reference
 from probe2road.errors import InputError
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.graph_files import read_graph

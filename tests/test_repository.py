@@ -25,12 +25,23 @@ MODULES = {
 }
 
 
-def layers() -> list[str]:
-    """Return the order of the modules that decision 0001 declares."""
+def block(name: str) -> list[str]:
+    """Return the lines of a block of decision 0001."""
     page = (ROOT / "docs" / "decisions" / "0001-layout-and-layering.md").read_text(encoding="utf-8")
-    block = re.search(r"```layers\n(.*?)```", page, re.DOTALL)
-    assert block is not None
-    return [line.split()[0] for line in block[1].splitlines()]
+    found = re.search(rf"```{name}\n(.*?)```", page, re.DOTALL)
+    assert found is not None
+    return found[1].splitlines()
+
+
+def layers() -> list[str]:
+    """Return the rooms in the order that decision 0001 declares."""
+    return [line.split()[0] for line in block("layers")]
+
+
+def parts() -> dict[str, list[str]]:
+    """Return the parts of each room, with their full names, in the order that decision 0001 declares."""
+    rooms = [line.split(": ") for line in block("rooms")]
+    return {room: [f"{room}.{part}" for part in names.split()] for room, names in rooms}
 
 
 def rank(module: str, order: list[str]) -> int:
@@ -56,7 +67,8 @@ def imports(module: str) -> Iterator[str]:
 def test_every_module_has_a_layer_and_every_layer_a_module() -> None:
     order = layers()
     assert len(order) == len(set(order))
-    assert [module for module in MODULES if rank(module, order) < 0] == []
+    outside = [module for module in MODULES if rank(module, order) < 0]
+    assert [module for module in outside if not any(name.startswith(f"{module}.") for name in order)] == []
     assert [name for name in order if name not in MODULES] == []
 
 
@@ -64,6 +76,23 @@ def test_every_module_has_a_layer_and_every_layer_a_module() -> None:
 def test_module_imports_only_what_stands_above_it(module: str) -> None:
     order = layers()
     assert [name for name in imports(module) if rank(name, order) > rank(module, order)] == []
+
+
+def test_every_room_lists_its_parts() -> None:
+    for room, listed in parts().items():
+        inside = {
+            ".".join(module.split(".")[: room.count(".") + 2]) for module in MODULES if module.startswith(f"{room}.")
+        }
+        assert sorted(listed) == sorted(inside), room
+
+
+@pytest.mark.parametrize("room", parts())
+def test_part_of_a_room_imports_only_what_stands_above_it(room: str) -> None:
+    order = parts()[room]
+    for module in MODULES:
+        if module.startswith(f"{room}."):
+            inside = [name for name in imports(module) if name.startswith(f"{room}.")]
+            assert [name for name in inside if rank(name, order) > rank(module, order)] == [], module
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:

@@ -176,7 +176,7 @@ def test_simulate_follows_the_seed(folder, call):
 def test_benchmark_prepare_makes_a_data_set_of_generated_roads(folder, call, monkeypatch):
     from dataclasses import replace
 
-    from probe2road.benchmark import datasets
+    from probe2road.benchmark.sets import datasets
 
     tiny = replace(datasets.find_dataset("corridor-1"), drive_km=8.0)
     monkeypatch.setattr(datasets, "DATASETS", {"corridor-1": tiny})

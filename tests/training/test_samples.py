@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probe2road.benchmark.recording import Recording
-from probe2road.benchmark.reference import labelled_reference
+from probe2road.benchmark.sets.recording import Recording
+from probe2road.benchmark.sets.reference import labelled_reference
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import fleet_from_tables
 from probe2road.io.fleet_reader import read_fleet

@@ -1,3 +1,1 @@
-"""The open benchmark: fleet data on real road networks with known truth, made from fixed seeds, and its splits."""
-
-from __future__ import annotations
+"""The open benchmark: data sets on real road networks with known truth, and the paper's tables made on them."""

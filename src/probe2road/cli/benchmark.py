@@ -27,7 +27,7 @@ def prepare(
 
     An interrupted run goes on where it stopped when it is started again.
     """
-    from probe2road.benchmark.prepare import prepare as prepare_datasets
+    from probe2road.benchmark.sets.prepare import prepare as prepare_datasets
 
     with progress_bar() as progress:
         for folder in prepare_datasets(names or [], output, data=data, workers=workers, progress=progress):
@@ -46,8 +46,8 @@ def align(
 
     An interrupted run goes on where it stopped when it is started again; what is aligned is taken as it is.
     """
-    from probe2road.benchmark.aligning import align_dataset
-    from probe2road.benchmark.datasets import find_datasets
+    from probe2road.benchmark.sets.aligning import align_dataset
+    from probe2road.benchmark.sets.datasets import find_datasets
 
     with progress_bar() as progress:
         for data in find_datasets(names or []):
@@ -68,7 +68,7 @@ def run(
 
     An interrupted run goes on where it stopped when it is started again.
     """
-    from probe2road.comparison.run import CITIES, run_benchmark
+    from probe2road.benchmark.tables.run import CITIES, run_benchmark
 
     with progress_bar() as progress:
         run_benchmark(
@@ -98,7 +98,7 @@ def ablate(
 
     An interrupted run goes on where it stopped when it is started again.
     """
-    from probe2road.comparison.ablate import run_ablations
+    from probe2road.benchmark.tables.ablate import run_ablations
 
     with progress_bar() as progress:
         run_ablations(

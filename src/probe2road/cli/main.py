@@ -318,8 +318,8 @@ def simulate(
 
     An interrupted run goes on where it stopped when it is started again.
     """
-    from probe2road.benchmark.recording import record_fleet
-    from probe2road.benchmark.residual import ResidualModel
+    from probe2road.benchmark.sets.recording import record_fleet
+    from probe2road.benchmark.sets.residual import ResidualModel
     from probe2road.simulation.networks.osm import read_network
     from probe2road.simulation.presets import find_preset
 

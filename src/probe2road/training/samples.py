@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from probe2road.benchmark.tiles import TILE_SIZE
+from probe2road.benchmark.sets.tiles import TILE_SIZE
 from probe2road.errors import OptionError
 from probe2road.raster.counts import count_pixels
 from probe2road.raster.lines import draw_lines

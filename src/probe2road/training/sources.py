@@ -11,11 +11,11 @@ import numpy as np
 import pandas as pd
 import shapely
 
-from probe2road.benchmark.datasets import find_datasets
-from probe2road.benchmark.prepare import read_tiles
-from probe2road.benchmark.recording import POSES, Recording
-from probe2road.benchmark.reference import labelled_reference
-from probe2road.benchmark.tiles import split_area
+from probe2road.benchmark.sets.datasets import find_datasets
+from probe2road.benchmark.sets.prepare import read_tiles
+from probe2road.benchmark.sets.recording import POSES, Recording
+from probe2road.benchmark.sets.reference import labelled_reference
+from probe2road.benchmark.sets.tiles import split_area
 from probe2road.errors import InputError, OptionError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet, read_fleet_files

@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import pytest
 
-from probe2road.benchmark.datasets import find_dataset
-from probe2road.benchmark.prepare import prepare_dataset
+from probe2road.benchmark.sets.datasets import find_dataset
+from probe2road.benchmark.sets.prepare import prepare_dataset
 
 
 @pytest.fixture(scope="session")

@@ -7,11 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from probe2road.benchmark.tables.cells import build_cell, score_cells
+from probe2road.benchmark.tables.methods import METHODS, find_methods
+from probe2road.benchmark.tables.run import run_benchmark
+from probe2road.benchmark.tables.source import Source, choose_drives, make_fleet
 from probe2road.cli.main import main
-from probe2road.comparison.cells import build_cell, score_cells
-from probe2road.comparison.methods import METHODS, find_methods
-from probe2road.comparison.run import run_benchmark
-from probe2road.comparison.source import Source, choose_drives, make_fleet
 from probe2road.errors import InputError, OptionError
 from probe2road.io.fleet_reader import read_fleet_files
 
@@ -52,8 +52,8 @@ def test_the_command_writes_tables_cells_and_pictures(tables):
 
 
 def test_a_second_run_builds_and_scores_nothing(sets, tables, monkeypatch):
-    monkeypatch.setattr("probe2road.comparison.cells.measure", None)
-    monkeypatch.setattr("probe2road.comparison.cells.score_graph", None)
+    monkeypatch.setattr("probe2road.benchmark.tables.cells.measure", None)
+    monkeypatch.setattr("probe2road.benchmark.tables.cells.score_graph", None)
     before = (tables / "cells.csv").read_text()
     run_benchmark(sets, tables, names=[NAME], methods=["probe2road", "kde"], poses="modelled")
     assert (tables / "cells.csv").read_text() == before

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from probe2road.benchmark import datasets
-from probe2road.benchmark import prepare as module
-from probe2road.benchmark.datasets import DATASETS, GROUPS, find_dataset, find_datasets, load_network
-from probe2road.benchmark.prepare import check_dataset, prepare, prepare_dataset, read_tiles
-from probe2road.benchmark.recording import Recording
-from probe2road.benchmark.reference import MAIN_ROADS, labelled_reference
-from probe2road.benchmark.tiles import split_tiles
+from probe2road.benchmark.sets import datasets
+from probe2road.benchmark.sets import prepare as module
+from probe2road.benchmark.sets.datasets import DATASETS, GROUPS, find_dataset, find_datasets, load_network
+from probe2road.benchmark.sets.prepare import check_dataset, prepare, prepare_dataset, read_tiles
+from probe2road.benchmark.sets.recording import Recording
+from probe2road.benchmark.sets.reference import MAIN_ROADS, labelled_reference
+from probe2road.benchmark.sets.tiles import split_tiles
 from probe2road.errors import InputError, OptionError
 from probe2road.graph.check import check_graph
 from probe2road.io.graph_files import read_graph

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probe2road.benchmark.reference import MAIN_ROADS, PRIMARY_ROADS, main_roads
+from probe2road.benchmark.sets.reference import MAIN_ROADS, PRIMARY_ROADS, main_roads
 from probe2road.errors import InputError, OptionError
 from probe2road.simulation.drawn.generate import INTERCHANGES, generate_corridor, generate_interchange, generate_town
 from probe2road.simulation.networks.network import RoadNetwork

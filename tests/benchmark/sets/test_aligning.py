@@ -7,12 +7,12 @@ import geopandas as gpd
 import numpy as np
 import pytest
 
-from probe2road.benchmark.aligning import align_dataset
-from probe2road.benchmark.datasets import find_dataset
-from probe2road.benchmark.prepare import check_dataset, prepare_dataset
-from probe2road.benchmark.recording import Recording
+from probe2road.benchmark.sets.aligning import align_dataset
+from probe2road.benchmark.sets.datasets import find_dataset
+from probe2road.benchmark.sets.prepare import check_dataset, prepare_dataset
+from probe2road.benchmark.sets.recording import Recording
+from probe2road.benchmark.tables.source import Source, make_fleet
 from probe2road.cli.main import main
-from probe2road.comparison.source import Source, make_fleet
 from probe2road.errors import InputError
 from probe2road.io.fleet_reader import read_fleet_files
 from probe2road.training.sources import Source as TrainingSource
@@ -62,12 +62,12 @@ def test_the_data_set_itself_stays_as_it_was(sets: Path, prepared: Path) -> None
 
 
 def test_what_is_aligned_is_taken_as_it_is(sets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("probe2road.benchmark.aligning.align", None)
+    monkeypatch.setattr("probe2road.benchmark.sets.aligning.align", None)
     assert align_dataset(sets / NAME) == Recording(sets / NAME).aligned
 
 
 def test_comparisons_take_the_aligned_fleet(sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("probe2road.benchmark.aligning.align", None)
+    monkeypatch.setattr("probe2road.benchmark.sets.aligning.align", None)
     source = Source(sets / NAME, tmp_path, "aligned")
     make_fleet(source)
     assert source.fleet_file == Recording(sets / NAME).aligned

@@ -14,12 +14,12 @@ import pyarrow.parquet as pq
 import shapely
 from numpy.typing import NDArray
 
-from probe2road.benchmark.aligning import align_dataset
-from probe2road.benchmark.datasets import find_dataset
-from probe2road.benchmark.prepare import check_dataset, read_tiles
-from probe2road.benchmark.recording import POSES, Recording
-from probe2road.benchmark.reference import labelled_reference
-from probe2road.benchmark.tiles import SPLITS, split_area
+from probe2road.benchmark.sets.aligning import align_dataset
+from probe2road.benchmark.sets.datasets import find_dataset
+from probe2road.benchmark.sets.prepare import check_dataset, read_tiles
+from probe2road.benchmark.sets.recording import POSES, Recording
+from probe2road.benchmark.sets.reference import labelled_reference
+from probe2road.benchmark.sets.tiles import SPLITS, split_area
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph

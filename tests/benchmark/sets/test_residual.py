@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe2road.benchmark.residual import ResidualModel, align_drives
+from probe2road.benchmark.sets.residual import ResidualModel, align_drives
 from probe2road.errors import OptionError
 from probe2road.fleet.contract import fleet_from_tables
 from probe2road.simulation.fleet_simulation import simulate

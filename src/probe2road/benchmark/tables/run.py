@@ -6,13 +6,13 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from probe2road.benchmark.datasets import find_dataset
-from probe2road.comparison.cells import Cell, read_built, score_cells, write_cells
-from probe2road.comparison.intervals import DRAWS
-from probe2road.comparison.methods import Method, find_methods
-from probe2road.comparison.pictures import busiest_places, draw_place
-from probe2road.comparison.source import Source
-from probe2road.comparison.tables import (
+from probe2road.benchmark.sets.datasets import find_dataset
+from probe2road.benchmark.tables.cells import Cell, read_built, score_cells, write_cells
+from probe2road.benchmark.tables.intervals import DRAWS
+from probe2road.benchmark.tables.methods import Method, find_methods
+from probe2road.benchmark.tables.pictures import busiest_places, draw_place
+from probe2road.benchmark.tables.source import Source
+from probe2road.benchmark.tables.tables import (
     cost_table,
     difference_table,
     methods_table,
@@ -50,14 +50,14 @@ def run_benchmark(
     Parameters
     ----------
     sets
-        Folder of the data sets that `probe2road.benchmark.prepare.prepare` made.
+        Folder of the data sets that `probe2road.benchmark.sets.prepare.prepare` made.
     output
         Folder for ``index.md`` (all tables), ``cells.csv`` (every cell with its configuration and seed) and pictures of
         the busiest places; created where it does not exist.
     names
         Data sets.
     methods
-        Out of `probe2road.comparison.methods.METHODS`; all that can run where there is none.
+        Out of `probe2road.benchmark.tables.methods.METHODS`; all that can run where there is none.
     work
         Folder that keeps graphs and scores, from which an interrupted run goes on; ``work`` in the output without it.
     poses

@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import shapely
 
-from probe2road.benchmark.residual import ResidualModel, align_drives
+from probe2road.benchmark.sets.residual import ResidualModel, align_drives
 from probe2road.errors import OptionError, OutputError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path, make_folder
@@ -77,7 +77,7 @@ class Recording:
 
     @property
     def aligned(self) -> Path:
-        """Traces as `probe2road.benchmark.aligning.align_dataset` leaves them; absent before."""
+        """Traces as `probe2road.benchmark.sets.aligning.align_dataset` leaves them; absent before."""
         return self.folder / "aligned.parquet"
 
     def traces(self, poses: str) -> Path:

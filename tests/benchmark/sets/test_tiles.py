@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import shapely
 
-from probe2road.benchmark.datasets import find_dataset, load_network
-from probe2road.benchmark.tiles import motorway_tiles, split_area, split_tiles
+from probe2road.benchmark.sets.datasets import find_dataset, load_network
+from probe2road.benchmark.sets.tiles import motorway_tiles, split_area, split_tiles
 from probe2road.errors import InputError, OptionError
 from probe2road.simulation.networks.network import network_from_sections
 

@@ -9,13 +9,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from probe2road.benchmark.datasets import find_dataset
-from probe2road.comparison.ablations import Ablation, Variant, find_ablations
-from probe2road.comparison.cells import FULL, Cell, build_cell, score_cells, write_cells
-from probe2road.comparison.figures import Point, draw_points
-from probe2road.comparison.intervals import DRAWS, Interval, f1_interval
-from probe2road.comparison.source import Source
-from probe2road.comparison.tables import ablation_table, markdown_table
+from probe2road.benchmark.sets.datasets import find_dataset
+from probe2road.benchmark.tables.ablations import Ablation, Variant, find_ablations
+from probe2road.benchmark.tables.cells import FULL, Cell, build_cell, score_cells, write_cells
+from probe2road.benchmark.tables.figures import Point, draw_points
+from probe2road.benchmark.tables.intervals import DRAWS, Interval, f1_interval
+from probe2road.benchmark.tables.source import Source
+from probe2road.benchmark.tables.tables import ablation_table, markdown_table
 from probe2road.errors import InputError
 from probe2road.io.atomic import atomic_path, make_folder
 from probe2road.run.progress import Progress, silent
@@ -51,19 +51,19 @@ def run_ablations(
     Parameters
     ----------
     sets
-        Folder of the data sets that `probe2road.benchmark.prepare.prepare` made.
+        Folder of the data sets that `probe2road.benchmark.sets.prepare.prepare` made.
     output
         Folder for ``index.md``, ``cells.csv`` and a figure for each ablation; created where it does not exist. What
         stands in its ``notes.toml`` under the name of an ablation goes into the page.
     name
         Data set. Of one with splits, its validation tiles are scored.
     only
-        Out of `probe2road.comparison.ablations.ABLATIONS`; all where there is none.
+        Out of `probe2road.benchmark.tables.ablations.ABLATIONS`; all where there is none.
     work
         Folder that keeps graphs and scores, from which an interrupted run goes on; it may be that of
-        `probe2road.comparison.run.run_benchmark`. ``work`` in the output without it.
+        `probe2road.benchmark.tables.run.run_benchmark`. ``work`` in the output without it.
     poses
-        As for `probe2road.comparison.run.run_benchmark`.
+        As for `probe2road.benchmark.tables.run.run_benchmark`.
     trainings
         JSON file of ``benchmarks/training_experiments.py``, from which the losses are compared.
     progress

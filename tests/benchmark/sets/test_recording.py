@@ -6,9 +6,9 @@ import pandas as pd
 import pytest
 import shapely
 
-from probe2road.benchmark import recording as module
-from probe2road.benchmark.recording import record_fleet
-from probe2road.benchmark.residual import ResidualModel, align_drives
+from probe2road.benchmark.sets import recording as module
+from probe2road.benchmark.sets.recording import record_fleet
+from probe2road.benchmark.sets.residual import ResidualModel, align_drives
 from probe2road.errors import OptionError, OutputError
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path

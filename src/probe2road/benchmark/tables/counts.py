@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from rasterio import Affine
 from rasterio.features import geometry_mask
 
-from probe2road.benchmark.tiles import TILE_SIZE
-from probe2road.comparison.intervals import COUNTS
+from probe2road.benchmark.sets.tiles import TILE_SIZE
+from probe2road.benchmark.tables.intervals import COUNTS
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.metrics.geo import GeoOptions, geo_samples
 from probe2road.metrics.itopo import ItopoOptions, itopo_pairs
@@ -33,7 +33,7 @@ def geo_counts(proposal: Network, reference: Network, options: GeoOptions | None
     Returns
     -------
     DataFrame
-        Index ``tile`` (``"column_row"``, as in `probe2road.benchmark.tiles`), columns `COUNTS`.
+        Index ``tile`` (``"column_row"``, as in `probe2road.benchmark.sets.tiles`), columns `COUNTS`.
 
     Examples
     --------

@@ -5,13 +5,13 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
+from probe2road.benchmark.tables import ablations
+from probe2road.benchmark.tables.ablate import run_ablations
+from probe2road.benchmark.tables.ablations import BASE, find_ablations, vary
+from probe2road.benchmark.tables.cells import build_cell, score_cells
+from probe2road.benchmark.tables.measured import Measured
+from probe2road.benchmark.tables.source import Source
 from probe2road.cli.main import main
-from probe2road.comparison import ablations
-from probe2road.comparison.ablate import run_ablations
-from probe2road.comparison.ablations import BASE, find_ablations, vary
-from probe2road.comparison.cells import build_cell, score_cells
-from probe2road.comparison.measured import Measured
-from probe2road.comparison.source import Source
 from probe2road.errors import InputError, OptionError
 from probe2road.recipe import Segmentation
 from probe2road.segmentation.weights import read_weights
@@ -24,7 +24,8 @@ LOSS = {"geo_f1": 0.9, "itopo_f1": 0.7, "soft_f1": 0.8, "steps": 600}
 def here(monkeypatch):
     """Build in this process, which has all modules."""
     monkeypatch.setattr(
-        "probe2road.comparison.cells.measure", lambda function, *arguments: Measured(function(*arguments), 0.0, 0.0)
+        "probe2road.benchmark.tables.cells.measure",
+        lambda function, *arguments: Measured(function(*arguments), 0.0, 0.0),
     )
 
 

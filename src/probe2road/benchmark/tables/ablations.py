@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any
 
-from probe2road.benchmark.recording import POSES
-from probe2road.comparison.methods import METHODS, Method
-from probe2road.comparison.source import Source
+from probe2road.benchmark.sets.recording import POSES
+from probe2road.benchmark.tables.methods import METHODS, Method
+from probe2road.benchmark.tables.source import Source
 from probe2road.errors import OptionError
 from probe2road.options import options_from_table
 from probe2road.recipe import BuildOptions

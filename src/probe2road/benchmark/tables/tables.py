@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from probe2road.comparison.cells import FULL, Cell
-from probe2road.comparison.intervals import Interval, difference_interval, f1_interval
-from probe2road.comparison.methods import METHODS
-from probe2road.comparison.published import METHODS_TABLE, SOFT_F1_TABLE, STAGES_TABLE, VISION_TABLE, Triple
+from probe2road.benchmark.tables.cells import FULL, Cell
+from probe2road.benchmark.tables.intervals import Interval, difference_interval, f1_interval
+from probe2road.benchmark.tables.methods import METHODS
+from probe2road.benchmark.tables.published import METHODS_TABLE, SOFT_F1_TABLE, STAGES_TABLE, VISION_TABLE, Triple
 from probe2road.metrics.scores import ratio
 
 __all__ = [

@@ -3,8 +3,8 @@ import pandas as pd
 import pytest
 import shapely
 
-from probe2road.comparison.counts import geo_counts, itopo_counts, soft_counts
-from probe2road.comparison.intervals import COUNTS, difference_interval, f1_interval
+from probe2road.benchmark.tables.counts import geo_counts, itopo_counts, soft_counts
+from probe2road.benchmark.tables.intervals import COUNTS, difference_interval, f1_interval
 from probe2road.graph.roadgraph import graph_from_lines
 from probe2road.metrics.geo import GeoOptions, geo_networks
 from probe2road.metrics.itopo import ItopoOptions, itopo_networks

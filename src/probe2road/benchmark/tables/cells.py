@@ -23,12 +23,12 @@ import pandas as pd
 import shapely
 
 from probe2road import __version__
-from probe2road.benchmark.datasets import find_dataset
-from probe2road.comparison.counts import geo_counts, itopo_counts, soft_counts
-from probe2road.comparison.intervals import COUNTS
-from probe2road.comparison.measured import measure
-from probe2road.comparison.methods import Method
-from probe2road.comparison.source import Source, make_fleet
+from probe2road.benchmark.sets.datasets import find_dataset
+from probe2road.benchmark.tables.counts import geo_counts, itopo_counts, soft_counts
+from probe2road.benchmark.tables.intervals import COUNTS
+from probe2road.benchmark.tables.measured import measure
+from probe2road.benchmark.tables.methods import Method
+from probe2road.benchmark.tables.source import Source, make_fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path
 from probe2road.io.fleet_reader import read_fleet
@@ -135,7 +135,7 @@ def score_graph(
     Returns
     -------
     tiles
-        Counts of GEO and iTOPO, tile by tile; see `probe2road.comparison.counts`.
+        Counts of GEO and iTOPO, tile by tile; see `probe2road.benchmark.tables.counts`.
     figures
         Precision, recall and F1 of every metric, ``median_m`` and ``p95_m`` of the lateral error, nodes, kilometres.
     """

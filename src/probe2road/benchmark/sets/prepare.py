@@ -14,10 +14,10 @@ import geopandas as gpd
 import numpy as np
 import pyogrio
 
-from probe2road.benchmark.datasets import OSM_NOTICE, Dataset, find_datasets, load_network
-from probe2road.benchmark.recording import Recording, record_fleet
-from probe2road.benchmark.residual import ResidualModel
-from probe2road.benchmark.tiles import motorway_tiles, split_tiles
+from probe2road.benchmark.sets.datasets import OSM_NOTICE, Dataset, find_datasets, load_network
+from probe2road.benchmark.sets.recording import Recording, record_fleet
+from probe2road.benchmark.sets.residual import ResidualModel
+from probe2road.benchmark.sets.tiles import motorway_tiles, split_tiles
 from probe2road.errors import InputError
 from probe2road.io.atomic import atomic_path, make_folder
 from probe2road.recipe import Progress
@@ -115,7 +115,7 @@ def prepare_dataset(
     --------
     >>> import tempfile
     >>> from dataclasses import replace
-    >>> from probe2road.benchmark.datasets import find_dataset
+    >>> from probe2road.benchmark.sets.datasets import find_dataset
     >>> tiny = replace(find_dataset("interchange-diamond-1"), drive_km=5.0)
     >>> with tempfile.TemporaryDirectory() as parent:
     ...     made = prepare_dataset(tiny, Path(parent, "tiny"), data="")
@@ -171,7 +171,7 @@ def check_dataset(folder: str | Path) -> None:
 
 
 def read_tiles(folder: str | Path) -> gpd.GeoDataFrame:
-    """Return the tiles of a data set with their splits; see `probe2road.benchmark.tiles.split_tiles`.
+    """Return the tiles of a data set with their splits; see `probe2road.benchmark.sets.tiles.split_tiles`.
 
     Raises
     ------

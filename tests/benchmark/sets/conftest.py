@@ -7,7 +7,7 @@ import pytest
 
 from probe2road.simulation.networks.network import network_from_sections
 
-DATA = Path(os.environ.get("PROBE2ROAD_DATA", Path(__file__).parents[3] / "shared" / "data"))
+DATA = Path(os.environ.get("PROBE2ROAD_DATA", Path(__file__).parents[4] / "shared" / "data"))
 
 
 @pytest.fixture(scope="session")

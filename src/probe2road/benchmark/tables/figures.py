@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from probe2road.comparison.intervals import Interval
+from probe2road.benchmark.tables.intervals import Interval
 from probe2road.draw.picture import BLUE, DPI, FRAME, INK, ORANGE, PURPLE, SOFT, save_figure
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 
 from probe2road.alignment.align import align
-from probe2road.benchmark.recording import Recording
+from probe2road.benchmark.sets.recording import Recording
 from probe2road.errors import InputError
 from probe2road.io.atomic import atomic_path
 from probe2road.io.fleet_reader import read_fleet_files
@@ -29,7 +29,7 @@ def align_dataset(folder: str | Path, *, workers: int = 1, progress: Progress | 
     Parameters
     ----------
     folder
-        The data set, from `probe2road.benchmark.prepare.prepare`.
+        The data set, from `probe2road.benchmark.sets.prepare.prepare`.
     workers
         Processes; no influence on the result beyond millimetres.
     progress
