@@ -26,7 +26,7 @@ TOLERANCE = 0.03  # of F1: libraries round differently, and a drive more or less
 
 def suite() -> ModuleType:
     """Load the benchmark, which is no part of the package."""
-    path = HERE.parents[1] / "benchmarks" / "junction_suite.py"
+    path = HERE.parents[1] / "experiments" / "junction_suite.py"
     spec = importlib.util.spec_from_file_location("junction_suite", path)
     assert spec is not None
     assert spec.loader is not None

@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 class KdeOptions:
     """The parameters, of which the paper publishes none.
 
-    The three that make the density were chosen by ``scripts/fit_kde.py``.
+    The three that make the density were chosen by ``experiments/fit_kde.py``.
     """
 
     resolution: float = 1.0  # m, side of a voxel in plan

@@ -1,6 +1,6 @@
 """The presets of the fleet simulator: every number in one place, with its source.
 
-Numbers that were fitted name the recording; those that nobody measured are marked as chosen. `scripts/fit_gnss.py`
+Numbers that were fitted name the recording; those that nobody measured are marked as chosen. `experiments/fit_gnss.py`
 repeats the fits, and docs/results/calibration.md compares the outcome with the recordings.
 """
 
@@ -59,7 +59,7 @@ class Preset:
     recording: RecordingModel = field(default_factory=RecordingModel)
 
 
-# Fitted to the single-point solution of an urban drive in Nagoya: scripts/fit_gnss.py --fit.
+# Fitted to the single-point solution of an urban drive in Nagoya: experiments/fit_gnss.py --fit.
 _NAGOYA = GnssModel(
     slow_sigma=1.59,
     slow_time=163.0,

@@ -63,7 +63,7 @@ def test_a_model_with_a_negative_size_is_refused():
 
 @pytest.fixture(scope="module")
 def fit():
-    path = Path(__file__).parents[3] / "scripts" / "fit_gnss.py"
+    path = Path(__file__).parents[3] / "experiments" / "fit_gnss.py"
     spec = importlib.util.spec_from_file_location("fit_gnss", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up

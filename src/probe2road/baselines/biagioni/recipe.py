@@ -64,7 +64,8 @@ class BiagioniOptions:
 
 
 # For fleet data whose traces lie within a metre or two: carriageways stay apart, bends are not cut, and drives of few
-# segments lose none. Chosen on training tiles by scripts/compare_biagioni.py; the published numbers are the defaults.
+# segments lose none. Chosen on training tiles by experiments/compare_biagioni.py; the published numbers are the
+# defaults.
 FLEET = BiagioniOptions(closing=0.0, simplify_tolerance=2.0, last_runs=True)
 
 

@@ -57,7 +57,7 @@ def load_network(path: str | Path) -> TrainedNetwork:
         network = T2RNet(state["width"])
         network.load_state_dict(state["network"])
     except Exception as error:  # torch raises whatever the file makes it stumble over
-        fix = "train some with scripts/train_deepmg.py"
+        fix = "train some with experiments/train_deepmg.py"
         raise InputError(f"not weights of T2RNet ({type(error).__name__})", where=path, fix=fix) from error
     return TrainedNetwork(network.eval(), find_variant(state["variant"]), FeatureOptions(**state["features"]))
 

@@ -75,7 +75,7 @@ def build_deepmg(
     fleet
         From `probe2road.read_fleet`.
     options
-        With the file of the weights, which ``scripts/train_deepmg.py`` makes.
+        With the file of the weights, which ``experiments/train_deepmg.py`` makes.
     workspace
         Folder for what the stages make, as for `probe2road.recipe.build`.
     progress
@@ -149,6 +149,6 @@ def _digest(weights: str) -> str:
     """Return a digest of the file of weights."""
     path = Path(weights)
     if not weights or not path.is_file():
-        fix = "train a network with scripts/train_deepmg.py and name its weights.pt"
+        fix = "train a network with experiments/train_deepmg.py and name its weights.pt"
         raise InputError("there is no such file of weights", where=weights or "DeepMGOptions", fix=fix)
     return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()

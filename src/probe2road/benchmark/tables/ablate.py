@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 _NOTES = "notes.toml"  # in the output: what the numbers mean, by name of the ablation
 _TRAININGS, _TRAININGS_TITLE = "loss", "Loss of the training"
-# Runs of benchmarks/training_experiments.py that have another loss.
+# Runs of experiments/training_experiments.py that have another loss.
 _LOSSES = {
     "base": "BCE + Dice",
     "cp_2x2": "CP-loss, buffer 2x2",
@@ -65,7 +65,7 @@ def run_ablations(
     poses
         As for `probe2road.benchmark.tables.run.run_benchmark`.
     trainings
-        JSON file of ``benchmarks/training_experiments.py``, from which the losses are compared.
+        JSON file of ``experiments/training_experiments.py``, from which the losses are compared.
     progress
         Called as the work goes on.
 
@@ -188,7 +188,7 @@ def _read_losses(path: Path) -> dict[str, dict[str, Any]]:
         losses = {label: runs[run] for run, label in _LOSSES.items() if run in runs}
         _loss_table(losses)  # all that is needed is there
     except (OSError, ValueError, TypeError, KeyError) as error:
-        fix = "name a file that benchmarks/training_experiments.py wrote"
+        fix = "name a file that experiments/training_experiments.py wrote"
         raise InputError(f"cannot be read as trainings ({error!r})", where=path, fix=fix) from error
     if not losses:
         raise InputError("has none of the runs of losses", where=path, fix=f"train {', '.join(_LOSSES)}")

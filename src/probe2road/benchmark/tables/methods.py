@@ -84,7 +84,7 @@ def find_methods(names: Sequence[str], *, deepmg: str | Path | None = None) -> l
     if unknown := [name for name in names if name not in METHODS]:
         raise OptionError(f"there is no method {unknown[0]!r}", where="benchmark", fix=f"use {', '.join(METHODS)}")
     if "deepmg" in names and deepmg is None:
-        fix = "train a network with scripts/train_deepmg.py and name its file"
+        fix = "train a network with experiments/train_deepmg.py and name its file"
         raise OptionError("DeepMG has no weights", where="benchmark", fix=fix)
     found = [METHODS[name] for name in names]
     return [

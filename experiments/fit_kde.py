@@ -1,7 +1,7 @@
 """Choose the parameters of the KDE baseline by GEO F1 on training tiles of Columbus.
 
     probe2road benchmark prepare columbus --output SETS
-    python scripts/fit_kde.py SETS/columbus            a few minutes on one core
+    python experiments/fit_kde.py SETS/columbus            a few minutes on one core
 
 Logs a Markdown table of all combinations, best first; the first row is what the defaults of KdeOptions are. Only
 tiles of the training split are read: some of them, drawn at random with a fixed seed, because one fleet drove all. The
@@ -16,6 +16,7 @@ import time
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import geopandas as gpd
 import numpy as np
@@ -63,15 +64,16 @@ def main() -> None:
     )
     rows = []
     for values in product(*GRID.values()):
-        options = replace(KdeOptions(), **dict(zip(GRID, values, strict=True)))
+        chosen: dict[str, Any] = dict(zip(GRID, values, strict=True))
+        options = replace(KdeOptions(), **chosen)
         started = time.perf_counter()
         graph = build_kde(fleet, options)
         geo, itopo = (row for row in evaluate(graph, truth, metrics=["geo", "itopo"], area=area).itertuples())
         rows.append((geo.f1, *values, geo.precision, geo.recall, itopo.f1))
         logger.info("%s: GEO F1 %.3f, %.0f s", values, geo.f1, time.perf_counter() - started)
     table = [f"| GEO F1 | {' | '.join(GRID)} | precision | recall | iTOPO F1 |", f"|---|{'---|' * (len(GRID) + 3)}"]
-    for f1, *values, precision, recall, itopo_f1 in sorted(rows, reverse=True):
-        shown = " | ".join(f"{value:g}" for value in values)
+    for f1, *parameters, precision, recall, itopo_f1 in sorted(rows, reverse=True):
+        shown = " | ".join(f"{value:g}" for value in parameters)
         table.append(f"| {f1:.3f} | {shown} | {precision:.3f} | {recall:.3f} | {itopo_f1:.3f} |")
     logger.info("%s", "\n".join(table))
 

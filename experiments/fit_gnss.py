@@ -1,7 +1,7 @@
 """Fit the GNSS error model to the real recordings, and show the two side by side.
 
-    python scripts/fit_gnss.py            compare the packaged parameters with the recordings
-    python scripts/fit_gnss.py --fit      search for the parameters first (ten minutes on one core)
+    python experiments/fit_gnss.py            compare the packaged parameters with the recordings
+    python experiments/fit_gnss.py --fit      search for the parameters first (ten minutes on one core)
 
 Needs the recordings (``gnss/nagoya``, ``gnss/comma2k19_i280``) under ``../shared/data``, or where PROBE2ROAD_DATA says.
 Writes the table to the log and the figure to ``docs/img/gnss-errors.png``.
@@ -222,13 +222,10 @@ def draw(recording: Recording, model: GnssModel, path: Path) -> None:
     runs = [gnss_errors(recording.t, model, rng=np.random.default_rng(seed)).error for seed in range(1000, 1050)]
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
     share = np.linspace(0, 1, len(recording.t))
-    for axis, title, size in (
-        (axes[0], "horizontal error", lambda e: np.hypot(e[:, 0], e[:, 1])),
-        (axes[1], "vertical error", lambda e: np.abs(e[:, 2])),
-    ):
+    for axis, title, columns in ((axes[0], "horizontal error", [0, 1]), (axes[1], "vertical error", [2])):
         for run in runs:
-            axis.plot(np.sort(size(run)), share, color="tab:orange", alpha=0.15, lw=0.8)
-        axis.plot(np.sort(size(recording.error)), share, color="black", lw=1.6)
+            axis.plot(np.sort(np.linalg.norm(run[:, columns], axis=1)), share, color="tab:orange", alpha=0.15, lw=0.8)
+        axis.plot(np.sort(np.linalg.norm(recording.error[:, columns], axis=1)), share, color="black", lw=1.6)
         axis.set(xscale="log", xlim=(0.2, 200), xlabel=f"{title}, m", ylabel="share of fixes")
         axis.grid(alpha=0.3)
     lags = tuple(range(1, 61))

@@ -1,7 +1,7 @@
 """Compare settings of the Biagioni baseline on training tiles of Columbus.
 
     probe2road benchmark prepare columbus --output SETS
-    python scripts/compare_biagioni.py SETS/columbus            a few minutes on one core
+    python experiments/compare_biagioni.py SETS/columbus            a few minutes on one core
 
 Logs a Markdown table of GEO and iTOPO for the published settings and for those that suit fleet data better, pooled over
 the tiles that ``fit_kde.py`` draws. Every tile is built on its own, because the method's memory follows the area.

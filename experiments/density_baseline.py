@@ -1,7 +1,7 @@
 """Build road graphs from the benchmark's data sets with the density segmenter and score them against the truth.
 
 Usage: probe2road benchmark prepare boston hannover tokyo_shibuya columbus milan --output SETS
-       python benchmarks/density_baseline.py SETS [--names boston,...] [--pictures docs/img]
+       python experiments/density_baseline.py SETS [--names boston,...] [--pictures docs/img]
 
 Prints the Markdown tables of docs/results/density-baseline.md. Every set is built from raw and from modelled fleet
 data, with the default options but without refinement, and scored against the roads that at least four drives

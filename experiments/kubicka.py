@@ -1,7 +1,7 @@
 """Score map matching on the tracks of Kubicka et al. (2015), whose true routes are known.
 
-python benchmarks/kubicka.py [DATA] [--intervals 1 5 15 30 60] [--profiles auto published]
-python benchmarks/kubicka.py --engine fastmm PYTHON FOLDER '{"gps_error": 10}'    (and osrm, valhalla; repeatable)
+python experiments/kubicka.py [DATA] [--intervals 1 5 15 30 60] [--profiles auto published]
+python experiments/kubicka.py --engine fastmm PYTHON FOLDER '{"gps_error": 10}'    (and osrm, valhalla; repeatable)
 
 An engine is run by PYTHON, with FOLDER, where it is installed, on its path; see kubicka_engines.py.
 

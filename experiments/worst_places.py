@@ -1,7 +1,7 @@
 """Draw the places where a built graph and the reference disagree most.
 
 Usage: probe2road benchmark run SETS --output TABLES --work WORK --poses modelled --name boston --method probe2road
-       python benchmarks/worst_places.py SETS/boston WORK/boston-modelled/probe2road/stages docs/img/worst-boston.png
+       python experiments/worst_places.py SETS/boston WORK/boston-modelled/probe2road/stages docs/img/worst-boston.png
 
 Every point on either graph, 5 m apart, that is farther than 6 m from the other graph counts for its square of 200 m.
 With `--junctions` every junction and dead end counts that is farther than 15 m from all of the other graph. The squares

@@ -1,6 +1,6 @@
 """Are the counts, directions, heights and speeds that evidence writes into a graph true?
 
-Usage: python benchmarks/evidence.py [--data ../shared/data] [--seed 21]
+Usage: python experiments/evidence.py [--data ../shared/data] [--seed 21]
 
 A simulated fleet is matched to the true centrelines, without their heights, directions and counts, and what evidence
 says of every edge is compared with the truth. The table of docs/concepts/evidence.md is the output; about a minute.

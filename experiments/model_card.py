@@ -1,6 +1,6 @@
 """Print what a weights file says about itself, as Markdown, and draw the curve of its training.
 
-Usage: python benchmarks/model_card.py src/probe2road/weights/gnss.onnx [--picture docs/img/model-gnss.png]
+Usage: python experiments/model_card.py src/probe2road/weights/gnss.onnx [--picture docs/img/model-gnss.png]
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Pictures of refinement, stage by stage, on graphs built from simulated traces.
 
-Run with ``python benchmarks/draw_junctions.py``; it writes the pictures of docs/concepts/refinement.md.
+Run with ``python experiments/draw_junctions.py``; it writes the pictures of docs/concepts/refinement.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Does centreline refinement bring edges nearer to the true centreline?
 
-Usage: python benchmarks/centreline.py [--data ../shared/data] [--seed 11] [--only NAME]
+Usage: python experiments/centreline.py [--data ../shared/data] [--seed 11] [--only NAME]
 
 Graphs are built from simulated fleets with all stages but this one, then moved by the same fleet, and compared with
 the true centrelines; then the same on the real traces of Chicago against its references. The seeds are not those that

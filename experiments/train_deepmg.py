@@ -1,6 +1,6 @@
 """Train the network of the baseline DeepMG on the training split of a benchmark data set.
 
-    python scripts/train_deepmg.py CONFIG.toml DATASET_FOLDER OUTPUT_FOLDER
+    python experiments/train_deepmg.py CONFIG.toml DATASET_FOLDER OUTPUT_FOLDER
 
 The first call computes the features of all tiles into OUTPUT_FOLDER; every call goes on from the last complete epoch.
 """

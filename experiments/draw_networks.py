@@ -1,6 +1,6 @@
 """Draw the pictures of docs/concepts/simulator-networks.md: a contact sheet of generated networks, and details.
 
-Usage: python scripts/draw_networks.py docs/img
+Usage: python experiments/draw_networks.py docs/img
 """
 
 from __future__ import annotations

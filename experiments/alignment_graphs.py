@@ -1,6 +1,6 @@
 """GEO and iTOPO of the graphs built from raw, from aligned and from true poses of a data set.
 
-    python benchmarks/alignment_graphs.py sets/boston --aligned boston.parquet --workspaces work
+    python experiments/alignment_graphs.py sets/boston --aligned boston.parquet --workspaces work
 
 Each version of the fleet is built with the default options of `probe2road.build` and scored against the roads that at
 least four drives passed. "true" is the raw fleet moved to its true poses, its points moved rigidly with them: what

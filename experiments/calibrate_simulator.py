@@ -1,9 +1,9 @@
 """Measure the simulator against what is known of real fleets: the tables and figures of docs/results/calibration.md.
 
-    python scripts/calibrate_simulator.py            everything, about two minutes on one core
+    python experiments/calibrate_simulator.py            everything, about two minutes on one core
 
 Needs the shared data under ``../shared/data``, or where PROBE2ROAD_DATA says. The GNSS model alone is compared by
-``scripts/fit_gnss.py``; this script measures what comes out of the whole simulator.
+``experiments/fit_gnss.py``; this script measures what comes out of the whole simulator.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ def draw_lateral(folder: Path, path: Path) -> None:
     rng = np.random.default_rng(1)
     made = [lane_wander(np.full(len(own), 0.1), DriverModel(), rng=rng) for own in real for _ in range(10)]
     figure, axis = plt.subplots(figsize=(5, 3.2), layout="constrained")
-    bins = np.linspace(-1.6, 1.6, 41)
+    bins = np.linspace(-1.6, 1.6, 41).tolist()
     for offsets, label, style in ((real, "NGSIM I-80", "black"), (made, "simulated", "tab:orange")):
         axis.hist(np.concatenate(offsets), bins, density=True, histtype="step", color=style, lw=1.5, label=label)
     axis.set(xlabel="lateral offset in the lane, m", ylabel="density")

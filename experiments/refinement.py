@@ -1,6 +1,6 @@
 """What each step of the refinement gives on the benchmark's test cities: the rows of the paper's Table V, and ours.
 
-Usage: python benchmarks/refinement.py FOLDER [NAMES...] [--segmenter network] [--work WORK] [--pictures docs/img]
+Usage: python experiments/refinement.py FOLDER [NAMES...] [--segmenter network] [--work WORK] [--pictures docs/img]
 
 FOLDER holds the data sets that `probe2road benchmark prepare` and `align` made. Graphs are built from the aligned fleet
 data, or are those that `probe2road benchmark run --work WORK` kept from before the refinement. Scores are against the

@@ -1,6 +1,6 @@
 """Build road graphs from the real public traces with the defaults and score them as the literature does.
 
-Usage: python benchmarks/real_traces.py [--data ../shared/data] [--segmenter density] [--pictures docs/img]
+Usage: python experiments/real_traces.py [--data ../shared/data] [--segmenter density] [--pictures docs/img]
 
 Prints Markdown tables: our row beside the published ones (Tang et al. 2019, IJGI 8:411, and the programs they
 compare), then the metrics of this project. Each build runs in a process of its own, from the raw file to the

@@ -1,6 +1,6 @@
 """Gap filling on simulated interchanges: how many true connections it restores, how many false ones it adds.
 
-Run with ``python benchmarks/gap_suite.py``. A link is true where the road between its two ends is hardly longer than
+Run with ``python experiments/gap_suite.py``. A link is true where the road between its two ends is hardly longer than
 the link itself; a dead end is a gap where the network does not end within 80 m.
 """
 

@@ -1,7 +1,7 @@
 """Short training runs that differ from the shipped configuration in one thing each, scored on validation squares.
 
 Usage: probe2road benchmark prepare columbus rhein_neckar porto milan interchanges corridors --output SETS
-       python benchmarks/training_experiments.py SETS RESULTS.json [--steps 800] [--names base,width_1,...]
+       python experiments/training_experiments.py SETS RESULTS.json [--steps 800] [--names base,width_1,...]
 
 Prints a Markdown table of docs/results/segmentation.md. Results are kept in RESULTS.json run by run; a run that is
 there already is not repeated. Every run has the same samples, steps and learning rates, and the seed of the

@@ -1,6 +1,6 @@
 """Junctions of every kind with a known number of drives for each movement: do these two edges connect here?
 
-Run with ``python benchmarks/junction_suite.py``; ``--builds`` scores whole builds from traces. The tables of
+Run with ``python experiments/junction_suite.py``; ``--builds`` scores whole builds from traces. The tables of
 docs/results/junctions.md are its output.
 """
 

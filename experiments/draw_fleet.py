@@ -1,6 +1,6 @@
 """Draw simulated fleet data at one place: boundaries red, markings green, traces blue, the reference graph black.
 
-    python scripts/draw_fleet.py ../shared/data/osm/columbus.osm.pbf 39.9738 -82.9840 docs/img/fleet-columbus.png
+    python experiments/draw_fleet.py ../shared/data/osm/columbus.osm.pbf 39.9738 -82.9840 docs/img/fleet-columbus.png
 
 The reference graph is drawn in a second panel over the traces.
 """

@@ -1,8 +1,8 @@
 """What alignment does to simulated raw fleets, measured against their true poses.
 
-    python benchmarks/alignment.py sets/columbus --area 327000 4424000 329000 4425500 --every 4
-    python benchmarks/alignment.py --simulate open_sky --area 327000 4424000 329000 4425500 --km 120
-    python benchmarks/alignment.py sets/boston --aligned sets/boston/aligned.parquet sets/boston/modelled.parquet
+    python experiments/alignment.py sets/columbus --area 327000 4424000 329000 4425500 --every 4
+    python experiments/alignment.py --simulate open_sky --area 327000 4424000 329000 4425500 --km 120
+    python experiments/alignment.py sets/boston --aligned sets/boston/aligned.parquet sets/boston/modelled.parquet
 
 The first form aligns a part of a prepared data set, the second one drives the Columbus network in that area anew and
 aligns that, and the third one scores files that `probe2road align` wrote, or the modelled data of the set, as a whole.

@@ -1,6 +1,6 @@
 """Do labels from map matching agree with the true drive counts, and do two matchers agree with each other?
 
-Usage: python benchmarks/labels_agreement.py [--data ../shared/data] [--osrm FOLDER] [--only NAME]
+Usage: python experiments/labels_agreement.py [--data ../shared/data] [--osrm FOLDER] [--only NAME]
 
 A simulated fleet is matched to the reference centrelines, without heights, as manual labels have none, and those pieces
 are kept that at least 4 traces drive: by our matcher, and by OSRM. Lengths kept are compared with those that at least 4

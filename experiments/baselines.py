@@ -1,6 +1,6 @@
 """Build road graphs from the real public traces with every method and score them as the literature does.
 
-Usage: python benchmarks/baselines.py [--data ../shared/data] [--deepmg WEIGHTS] [--pictures docs/img]
+Usage: python experiments/baselines.py [--data ../shared/data] [--deepmg WEIGHTS] [--pictures docs/img]
 
 Prints the Markdown tables of docs/results/baselines.md: the rows of all methods beside those of the published
 programs, and the metrics of this project. Each build runs in a process of its own, from the raw file to the graph.

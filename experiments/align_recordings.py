@@ -1,6 +1,6 @@
 """Alignment of single real drives: is the aligned pose nearer to the reference than the receiver's?
 
-    python benchmarks/align_recordings.py --data ../shared/data/gnss
+    python experiments/align_recordings.py --data ../shared/data/gnss
 
 Nagoya: a single-point GNSS solution at 1 Hz among tall buildings, with a reference at 5 Hz. I-280: a consumer receiver
 at 10 Hz on a motorway, one minute. One drive has nobody to agree with, so this measures what smoothing with odometry
