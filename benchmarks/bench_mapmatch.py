@@ -82,9 +82,9 @@ def main() -> None:
         rows = np.arange(len(truth)) % DURATION % interval == 0
         thinned = Fleet(fleet.traces[rows].reset_index(drop=True), fleet.points, fleet.crs)
         first = Fleet(thinned.traces[: DURATION // interval], fleet.points, fleet.crs)
-        match(first, graph, MatchOptions(profile=profile))  # compile
+        match(graph, first, options=MatchOptions(profile=profile))  # compile
         started = process_time()
-        found = match(thinned, graph, MatchOptions(profile=profile))
+        found = match(graph, thinned, options=MatchOptions(profile=profile))
         seconds = process_time() - started
         known = truth[rows] >= 0
         right = (found.fixes["edge"].to_numpy(np.int64, na_value=-1)[known] == truth[rows][known]).mean()

@@ -58,7 +58,7 @@ def print_flaws() -> None:
             for phase in np.arange(0.0, 11.0, 0.5)
         ]
         plain = [geo(road, reference).f1 for road in moved]
-        pooled = [geo(road, reference, GeoOptions(phases=11)).f1 for road in moved]
+        pooled = [geo(road, reference, options=GeoOptions(phases=11)).f1 for road in moved]
         numbers = (min(plain), max(plain), float(np.mean(plain)), min(pooled), max(pooled))
         print(f"{offset:>6.1f} m" + "".join(f"{number:>8.3f}" for number in numbers))
 

@@ -38,12 +38,12 @@ def biagioni(fleet: Fleet) -> RoadGraph:
 
 def biagioni_last_runs(fleet: Fleet) -> RoadGraph:
     """With the last run of every trip."""
-    return build_biagioni(fleet, BiagioniOptions(last_runs=True))
+    return build_biagioni(fleet, options=BiagioniOptions(last_runs=True))
 
 
 def biagioni_paper_sigma(fleet: Fleet) -> RoadGraph:
     """With the Gaussian that the paper states."""
-    return build_biagioni(fleet, BiagioniOptions(sigma="paper"))
+    return build_biagioni(fleet, options=BiagioniOptions(sigma="paper"))
 
 
 def kde(fleet: Fleet) -> RoadGraph:
@@ -58,7 +58,7 @@ def probe2road(fleet: Fleet) -> RoadGraph:
 
 def probe2road_density(fleet: Fleet) -> RoadGraph:
     """With the density segmenter."""
-    return build(fleet, BuildOptions(segmenter="density"))
+    return build(fleet, options=BuildOptions(segmenter="density"))
 
 
 METHODS: dict[str, Callable[[Fleet], RoadGraph]] = {
@@ -123,7 +123,7 @@ def report(city: str, folder: Path, pictures: Path | None, weights: Path | None)
 def build_city(name: str, city: str, folder: Path, weights: Path | None) -> RoadGraph:
     """Read the traces and build."""
     if name == DEEPMG:
-        return build_deepmg(read_city(city, folder), DeepMGOptions(weights=str(weights)))
+        return build_deepmg(read_city(city, folder), options=DeepMGOptions(weights=str(weights)))
     return METHODS[name](read_city(city, folder))
 
 

@@ -76,8 +76,8 @@ def network_of(case: str, data: Path, seed: int) -> RoadNetwork | None:
 def simulated(case: str, network: RoadNetwork, preset: str, seed: int) -> None:
     """Build and refine one graph and print its row."""
     result = simulate(network, preset=preset, n_drives=_DRIVES.get(case, 300), seed=seed)
-    graph = build(result.fleet, UNMOVED)
-    matches = match(result.fleet, graph)
+    graph = build(result.fleet, options=UNMOVED)
+    matches = match(graph, result.fleet)
     refined = refine_centreline(graph, result.fleet, matches)
     alone = refine_centreline(graph, result.fleet, matches, options=CentrelineOptions(boundaries=False))
     before, after, by_traces = (figures(lateral_errors(g, result.reference)) for g in (graph, refined, alone))
@@ -112,9 +112,9 @@ def chicago(folder: Path) -> None:
         print(f"\n{folder} is not there")
         return
     fleet: Fleet = read_fleet(folder / "traces.csv.gz", columns={"trace_id": "trip"}, crs="EPSG:32616")
-    graph = build(fleet, UNMOVED)
+    graph = build(fleet, options=UNMOVED)
     start = process_time()
-    matches = match(fleet, graph)
+    matches = match(graph, fleet)
     middle = process_time()
     refined = refine_centreline(graph, fleet, matches)
     print(f"\nChicago: {len(fleet.traces):,} fixes, matching {middle - start:.1f} s, ", end="")

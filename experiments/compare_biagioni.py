@@ -53,7 +53,7 @@ def main() -> None:
     for name, options in SETTINGS.items():
         counts = np.zeros((2, 3))
         for part, area in parts:
-            scores = evaluate(build_biagioni(part, options), truth, metrics=["geo", "itopo"], area=area)
+            scores = evaluate(build_biagioni(part, options=options), truth, metrics=["geo", "itopo"], area=area)
             counts += scores[["matched_proposal", "proposal", "reference"]].to_numpy(np.float64)
         logger.info("| %s | %s |", name, " | ".join(triple(*count) for count in counts))
 

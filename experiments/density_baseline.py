@@ -103,7 +103,7 @@ def report(name: str, recording: Recording, pictures: Path | None) -> None:
 def timed_build(name: str, source: str, fleet: Fleet) -> Built:
     """Build with the defaults, but without the stages that match traces to the graph."""
     started = time.perf_counter()
-    graph = build(fleet, BuildOptions(segmenter="density", refine=False))
+    graph = build(fleet, options=BuildOptions(segmenter="density", refine=False))
     return Built(name, source, graph, time.perf_counter() - started)
 
 

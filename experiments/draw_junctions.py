@@ -39,11 +39,11 @@ ROAD, EDGE, GAP, NODE, DEAD_END = "#d9dde3", "#27496d", "#d1495b", "#111111", "#
 def stages(simulated: SimulatedFleet) -> list[RoadGraph]:
     """Build a graph and return it after each step."""
     fleet = simulated.fleet
-    graph = build(fleet, BuildOptions(segmenter="density", refine=False))
+    graph = build(fleet, options=BuildOptions(segmenter="density", refine=False))
     filled = fill_gaps(graph)
-    pruned = clean_graph(prune_gaps(filled, match(fleet, filled, edge_weights=gap_weights(filled)).steps))
-    matches = match(fleet, pruned)
-    split = split_false_junctions(pruned, matches.steps, positions=passing_positions(fleet, matches, pruned))
+    pruned = clean_graph(prune_gaps(filled, match(filled, fleet, edge_weights=gap_weights(filled)).steps))
+    matches = match(pruned, fleet)
+    split = split_false_junctions(pruned, matches.steps, positions=passing_positions(pruned, fleet, matches))
     return [graph, filled, pruned, split]
 
 

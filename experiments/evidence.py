@@ -62,7 +62,7 @@ def row(result: SimulatedFleet) -> list[str]:
     """Compare evidence with truth."""
     truth = result.reference
     graph = bare(truth)
-    found = add_evidence(graph, result.fleet, match(result.fleet, graph))
+    found = add_evidence(graph, result.fleet, match(graph, result.fleet))
     support, true_support = (g.edges["support"].to_numpy(np.float64) for g in (found, truth))
     driven = true_support > 0
     off = np.abs(support - true_support)[driven]

@@ -67,7 +67,7 @@ def main() -> None:
         chosen: dict[str, Any] = dict(zip(GRID, values, strict=True))
         options = replace(KdeOptions(), **chosen)
         started = time.perf_counter()
-        graph = build_kde(fleet, options)
+        graph = build_kde(fleet, options=options)
         geo, itopo = (row for row in evaluate(graph, truth, metrics=["geo", "itopo"], area=area).itertuples())
         rows.append((geo.f1, *values, geo.precision, geo.recall, itopo.f1))
         logger.info("%s: GEO F1 %.3f, %.0f s", values, geo.f1, time.perf_counter() - started)

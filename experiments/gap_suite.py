@@ -69,7 +69,7 @@ def measure(kind: str, preset: str, drives: int) -> list[dict[str, object]]:
     network = generate_interchange(kind, rng=np.random.default_rng(1))
     simulated = simulate(network, preset=replace(find_preset(preset), camera=None), n_drives=drives, seed=1)
     reference, distances = simulated.reference, road_distances(simulated.reference)
-    graph = build(simulated.fleet, BuildOptions(segmenter="density", refine=False))
+    graph = build(simulated.fleet, options=BuildOptions(segmenter="density", refine=False))
     border = shapely.union_all(reference.nodes.geometry[reference.degrees() == 1].to_numpy())
     ends = graph.nodes[graph.degrees() == 1]
     inner = ends.index[ends.geometry.distance(border).fillna(np.inf) > _BORDER]
@@ -78,7 +78,7 @@ def measure(kind: str, preset: str, drives: int) -> list[dict[str, object]]:
         filled = fill_gaps(graph, options=options)
         links = filled.edges[filled.edges["origin"] == "gap"]
         true = true_links(links, reference, distances)
-        steps = match(simulated.fleet, filled, edge_weights=gap_weights(filled)).steps
+        steps = match(filled, simulated.fleet, edge_weights=gap_weights(filled)).steps
         through = steps[steps["entered"] & steps["left"]].groupby("edge")["trace_id"].nunique()
         kept = (through.reindex(links.index, fill_value=0) >= 4).to_numpy()
         pruned = prune_gaps(filled, steps)

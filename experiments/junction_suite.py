@@ -228,8 +228,8 @@ def score_plan(name: str, preset: str, counts: Iterable[int], *, seed: int) -> p
     plan = plan_graph(network)
     counts = list(counts)
     fleet, repetition = drive_movements(network, preset, max(max(counts), 1), seed=seed)
-    matches = match(fleet, plan.graph)
-    positions = passing_positions(fleet, matches, plan.graph)
+    matches = match(plan.graph, fleet)
+    positions = passing_positions(plan.graph, fleet, matches)
     rows = []
     for k in counts:
         steps, known = of_repetitions(matches, positions, repetition, k)
@@ -251,11 +251,11 @@ def score_builds(name: str, preset: str, counts: Iterable[int], *, seed: int) ->
     for k in counts:
         chosen = fleet.traces["trace_id"].map(repetition) < k
         some = replace(fleet, traces=fleet.traces[chosen].reset_index(drop=True))
-        built = build(some, BuildOptions(segmenter="density", refine=False))
+        built = build(some, options=BuildOptions(segmenter="density", refine=False))
         filled = fill_gaps(built)
-        joined = clean_graph(prune_gaps(filled, match(some, filled, edge_weights=gap_weights(filled)).steps))
-        matches = match(some, joined)
-        positions = passing_positions(some, matches, joined)
+        joined = clean_graph(prune_gaps(filled, match(filled, some, edge_weights=gap_weights(filled)).steps))
+        matches = match(joined, some)
+        positions = passing_positions(joined, some, matches)
         graphs = {"segmentation": built}
         for variant, (options, with_heights) in VARIANTS.items():
             graphs[variant] = joined

@@ -185,10 +185,10 @@ def ours(tracks: list[Track], interval: float, options: MatchOptions) -> tuple[l
     fleets = fleet_of(tracks, interval, copies=COPIES)
     started = process_time()
     for fleet, track in zip(fleets, tracks, strict=True):
-        match(fleet, track.graph, options)
+        match(track.graph, fleet, options=options)
     seconds = (process_time() - started) / COPIES
     fleets = fleet_of(tracks, interval)
-    matched = [match(fleet, track.graph, options) for fleet, track in zip(fleets, tracks, strict=True)]
+    matched = [match(track.graph, fleet, options=options) for fleet, track in zip(fleets, tracks, strict=True)]
     return [found_of(matches, track) for matches, track in zip(matched, tracks, strict=True)], seconds
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from probe2road.errors import MissingExtraError
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.matching.labels import LabelOptions, cut_reference, label_reference
+from probe2road.matching.labels import LabelOptions, cut_reference, label
 from probe2road.matching.osrm import find_osrm
 from probe2road.simulation.drawn.generate import generate_interchange
 from probe2road.simulation.fleet_simulation import SimulatedFleet, simulate
@@ -81,7 +81,7 @@ def compare(title: str, result: SimulatedFleet, directed: bool, matchers: tuple[
     for matcher in matchers:
         options = LabelOptions(min_traces=0, matcher=matcher, osrm_folder=folder)
         start = perf_counter()
-        labelled = label_reference(reference, result.fleet, options=options)
+        labelled = label(reference, result.fleet, options=options)
         seconds[matcher] = perf_counter() - start
         counts[matcher] = labelled.edges["support"].reindex(pieces.edges.index).to_numpy(np.int64)
     length = pieces.edges["length"].to_numpy()

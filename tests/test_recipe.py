@@ -44,7 +44,7 @@ def crossing():
 
 
 def test_a_crossing_comes_out(crossing):
-    graph = build(crossing, BuildOptions(segmenter="density", refine=False))
+    graph = build(crossing, options=BuildOptions(segmenter="density", refine=False))
     check_graph(graph)
     assert sorted(graph.degrees()) == [1, 1, 1, 1, 4]
     reference = graph_from_lines([np.array(line) + ORIGIN for line in CROSS], crs=CRS)
@@ -54,7 +54,7 @@ def test_a_crossing_comes_out(crossing):
 
 
 def test_roads_that_nobody_turns_between_cross_without_a_node(crossing):
-    graph = build(crossing, DENSITY)
+    graph = build(crossing, options=DENSITY)
     check_graph(graph)
     assert sorted(graph.degrees()) == [1, 1, 1, 1]
     assert graph.edges.geometry.iloc[0].crosses(graph.edges.geometry.iloc[1])
@@ -62,13 +62,13 @@ def test_roads_that_nobody_turns_between_cross_without_a_node(crossing):
 
 def test_roads_that_drives_turn_between_meet():
     turning = drives([(0, 400), (800, 400)], [(400, 0), (400, 800)], [(0, 400), (400, 400), (400, 800)])
-    graph = build(turning, DENSITY)
+    graph = build(turning, options=DENSITY)
     assert sorted(graph.degrees()) == [1, 1, 1, 1, 4]
     assert len(graph.turns) >= 3
 
 
 def test_every_stage_is_kept_on_request(crossing, tmp_path):
-    graph = build(crossing, DENSITY, workspace=tmp_path / "stages")
+    graph = build(crossing, options=DENSITY, workspace=tmp_path / "stages")
     probability, grid = read_raster(tmp_path / "stages" / "1-probability.tif")
     mask, _ = read_raster(tmp_path / "stages" / "2-mask.tif")
     skeleton, _ = read_raster(tmp_path / "stages" / "3-skeleton.tif")
@@ -82,7 +82,7 @@ def test_every_stage_is_kept_on_request(crossing, tmp_path):
 
 def test_an_interrupted_run_goes_on_where_it_stopped(crossing, tmp_path, monkeypatch):
     options = BuildOptions(segmenter="density", density=DensityOptions(bandwidth=4.5))
-    whole = build(crossing, options)
+    whole = build(crossing, options=options)
     monkeypatch.setattr("probe2road.segmentation.density._WINDOW", 256)
     windows = []
 
@@ -91,13 +91,13 @@ def test_an_interrupted_run_goes_on_where_it_stopped(crossing, tmp_path, monkeyp
             windows.append("stop")
             raise KeyboardInterrupt
         windows.append(grid.bounds)
-        return density_probability(counts, grid, options)
+        return density_probability(counts, grid, options=options)
 
     monkeypatch.setattr("probe2road.segmentation.density.density_probability", counting)
     with pytest.raises(KeyboardInterrupt):
-        build(crossing, options, workspace=tmp_path / "work")
+        build(crossing, options=options, workspace=tmp_path / "work")
     assert len(list((tmp_path / "work").glob("window-*.npz"))) == 3
-    graph = build(crossing, options, workspace=tmp_path / "work")
+    graph = build(crossing, options=options, workspace=tmp_path / "work")
     windows.remove("stop")
     assert len(windows) == len(set(windows)) > 3  # none was done twice
     assert not list((tmp_path / "work").glob("window-*.npz"))
@@ -115,39 +115,39 @@ def test_the_bandwidth_is_estimated_once_for_all_parts_of_a_run(crossing, tmp_pa
         predictions.append(options.bandwidth)
         if len(predictions) == 1:
             raise KeyboardInterrupt
-        return density_probability(counts, grid, options)
+        return density_probability(counts, grid, options=options)
 
     monkeypatch.setattr("probe2road.segmentation.density.estimate_bandwidth", estimating)
     monkeypatch.setattr("probe2road.segmentation.density.density_probability", failing_at_first)
     with pytest.raises(KeyboardInterrupt):
-        build(crossing, BuildOptions(segmenter="density", refine=False), workspace=tmp_path / "work")
-    build(crossing, BuildOptions(segmenter="density", refine=False), workspace=tmp_path / "work")
+        build(crossing, options=BuildOptions(segmenter="density", refine=False), workspace=tmp_path / "work")
+    build(crossing, options=BuildOptions(segmenter="density", refine=False), workspace=tmp_path / "work")
     (tmp_path / "work" / "7-roads.gpkg").unlink()
-    build(crossing, BuildOptions(segmenter="density", refine=False), workspace=tmp_path / "work")
+    build(crossing, options=BuildOptions(segmenter="density", refine=False), workspace=tmp_path / "work")
     assert estimates == [5.0]
     assert set(predictions) == {5.0}
 
 
 def test_a_workspace_of_another_run_is_not_mixed_in(crossing, tmp_path, caplog):
-    build(crossing, DENSITY, workspace=tmp_path / "work")
+    build(crossing, options=DENSITY, workspace=tmp_path / "work")
     with caplog.at_level(logging.INFO):
         other = build(
             crossing,
-            BuildOptions(segmenter="density", density=DensityOptions(bandwidth=9.0)),
+            options=BuildOptions(segmenter="density", density=DensityOptions(bandwidth=9.0)),
             workspace=tmp_path / "work",
         )
     assert "starting afresh" in caplog.text
-    again = build(crossing, BuildOptions(segmenter="density", density=DensityOptions(bandwidth=9.0)))
+    again = build(crossing, options=BuildOptions(segmenter="density", density=DensityOptions(bandwidth=9.0)))
     assert other.edges.geometry.geom_equals_exact(again.edges.geometry, 1e-6).all()
 
 
 def test_options_behind_the_segmentation_keep_its_probability(crossing, tmp_path, monkeypatch):
-    build(crossing, DENSITY, workspace=tmp_path / "work")
+    build(crossing, options=DENSITY, workspace=tmp_path / "work")
     monkeypatch.setattr("probe2road.recipe.predict_window", None)  # nothing is predicted again
     other = replace(DENSITY, thinning="zhang_suen", clean=CleanOptions(dead_end=40.0))
-    graph = build(crossing, other, workspace=tmp_path / "work")
+    graph = build(crossing, options=other, workspace=tmp_path / "work")
     monkeypatch.undo()
-    again = build(crossing, other)
+    again = build(crossing, options=other)
     assert graph.edges.geometry.geom_equals_exact(again.edges.geometry, 1e-6).all()
 
 
@@ -159,31 +159,31 @@ def test_an_unknown_thinning_is_refused():
 def test_a_folder_with_other_things_in_it_is_left_alone(crossing, tmp_path):
     (tmp_path / "thesis.tex").write_text("chapter 1")
     with pytest.raises(OutputError, match="not a workspace"):
-        build(crossing, DENSITY, workspace=tmp_path)
+        build(crossing, options=DENSITY, workspace=tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["thesis.tex"]
 
 
 def test_progress_is_reported_to_the_end(crossing):
     told = []
-    build(crossing, DENSITY, progress=lambda *args: told.append(args))
+    build(crossing, options=DENSITY, progress=lambda *args: told.append(args))
     assert [stage for stage, done, total in told if done == total] == ["segmentation", "graph", "matching"]
 
 
 def test_a_finer_grid_gives_the_same_roads(crossing):
-    coarse, fine = (build(crossing, BuildOptions(segmenter="density", resolution=r)) for r in (1.0, 0.5))
+    coarse, fine = (build(crossing, options=BuildOptions(segmenter="density", resolution=r)) for r in (1.0, 0.5))
     assert evaluate(fine, coarse, metrics=["geo"])["f1"].iloc[0] > 0.9
 
 
 def test_a_single_fix_makes_no_road():
     table = pd.DataFrame({"trace_id": [1], "t": [0], "x": [446000.0], "y": [4636000.0]})
-    graph = build(fleet_from_tables(table, crs=CRS, target_crs=CRS), DENSITY)
+    graph = build(fleet_from_tables(table, crs=CRS, target_crs=CRS), options=DENSITY)
     check_graph(graph)
     assert graph.edges.empty
 
 
 def test_no_fixes_are_an_error(crossing):
     with pytest.raises(InputError, match="no fixes"):
-        build(Fleet(crossing.traces.iloc[:0], crossing.points, crossing.crs), DENSITY)
+        build(Fleet(crossing.traces.iloc[:0], crossing.points, crossing.crs), options=DENSITY)
 
 
 def test_an_unknown_segmenter_is_an_error():

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0.dev0"
 
 if TYPE_CHECKING:
-    from probe2road.draw.page import write_view
+    from probe2road.draw.page import view
     from probe2road.errors import Probe2RoadError
     from probe2road.fleet.contract import Fleet, TraceGaps, fleet_from_tables
     from probe2road.graph.check import check_graph
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from probe2road.io.fleet_writer import write_fleet
     from probe2road.io.graph_files import read_graph, write_graph
     from probe2road.io.graph_networkx import from_networkx, to_networkx
-    from probe2road.matching.labels import label_reference
+    from probe2road.matching.labels import label
     from probe2road.matching.match import Matches, MatchOptions, match
     from probe2road.metrics.evaluate import evaluate
     from probe2road.raster.counts import rasterize
     from probe2road.recipe import BuildOptions, build
-    from probe2road.refinement.recipe import refine_graph
+    from probe2road.refinement.recipe import refine
 
 _HOME = {
     "Probe2RoadError": "errors",
@@ -47,12 +47,12 @@ _HOME = {
     "MatchOptions": "matching.match",
     "Matches": "matching.match",
     "match": "matching.match",
-    "refine_graph": "refinement.recipe",
-    "label_reference": "matching.labels",
+    "refine": "refinement.recipe",
+    "label": "matching.labels",
     "BuildOptions": "recipe",
     "build": "recipe",
     "evaluate": "metrics.evaluate",
-    "write_view": "draw.page",
+    "view": "draw.page",
 }
 
 __all__ = [
@@ -71,16 +71,16 @@ __all__ = [
     "fleet_from_tables",
     "from_networkx",
     "graph_from_lines",
-    "label_reference",
+    "label",
     "match",
     "rasterize",
     "read_fleet",
     "read_graph",
-    "refine_graph",
+    "refine",
     "to_networkx",
+    "view",
     "write_fleet",
     "write_graph",
-    "write_view",
 ]
 
 

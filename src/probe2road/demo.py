@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from probe2road.draw.page import write_view
+from probe2road.draw.page import view
 from probe2road.draw.stages import draw_stages
 from probe2road.fleet.contract import Fleet
 from probe2road.io.atomic import make_folder
@@ -82,11 +82,11 @@ def run_demo(folder: str | Path, *, progress: Progress | None = None) -> tuple[d
     write_graph(graph, roads)
     scores = evaluate(graph, simulated.reference, metrics=["geo", "itopo"])
 
-    view, filmstrip = folder / "roads.html", folder / "stages.png"
-    write_view(graph, view, traces=fleet, title="probe2road demo: a cloverleaf")
+    page, filmstrip = folder / "roads.html", folder / "stages.png"
+    view(graph, page, fleet=fleet, title="probe2road demo: a cloverleaf")
     draw_stages(folder / "stages", fleet, filmstrip)
     files = {
-        view: "the roads over the traces, in any browser",
+        page: "the roads over the traces, in any browser",
         filmstrip: "how they came about, stage by stage",
         roads: "the road graph, in QGIS",
         truth: "the roads that the simulated vehicles drove",

@@ -16,7 +16,7 @@ from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster.counts import fleet_grid, rasterize_windows
 from probe2road.raster.grid import Grid, sparse_zeros
-from probe2road.refinement.recipe import RefineOptions, refine_graph
+from probe2road.refinement.recipe import RefineOptions, refine
 from probe2road.run.progress import Progress, silent
 from probe2road.run.workspace import Workspace, open_workspace
 from probe2road.segmentation.density import DensityOptions, density_segmenter
@@ -77,8 +77,8 @@ class Segmentation:
 
 def build(
     fleet: Fleet,
-    options: BuildOptions | None = None,
     *,
+    options: BuildOptions | None = None,
     workspace: str | Path | None = None,
     progress: Progress | None = None,
 ) -> RoadGraph:
@@ -144,12 +144,12 @@ def build(
     report("graph", 0, 1)
     graph = vectorize(skeleton, grid, probability=probability, options=options.vectorize)
     work.write_graph("4-vectorized", graph)
-    graph = clean_graph(graph, options.clean)
+    graph = clean_graph(graph, options=options.clean)
     work.write_graph("5-cleaned", graph)
     report("graph", 1, 1)
     if options.refine:
         refinement = options.refinement.for_segmenter(learned=weights is not None)
-        graph = refine_graph(graph, fleet, refinement, clean=options.clean, work=work, report=report)
+        graph = refine(graph, fleet, options=refinement, clean=options.clean, workspace=work, progress=report)
     work.write_graph("7-roads", graph)
     return graph
 
@@ -160,7 +160,7 @@ def _segmenter(fleet: Fleet, grid: Grid, options: BuildOptions, weights: Weights
         return network_segmenter(weights, grid, options.network)
     kept = work.read_record("1-density")
     density = options.density if kept is None else DensityOptions(**kept)
-    segmenter = density_segmenter(fleet, grid, density, gaps=options.gaps)
+    segmenter = density_segmenter(fleet, grid, options=density, gaps=options.gaps)
     if kept is None:
         work.write_record("1-density", segmenter.parameters)
     return segmenter

@@ -146,20 +146,20 @@ def test_bad_drives_are_reported_and_do_no_harm(road: Any) -> None:
     stays = fleet.traces["trace_id"] == 6
     assert result.fleet.traces[stays].equals(fleet.traces[stays])
     assert np.ptp(road.lateral(result.fleet, [*LANES[:6], 0.0])[:6]) < 0.3
-    dropped = align(fleet, AlignOptions(keep_rejected=False)).fleet
+    dropped = align(fleet, options=AlignOptions(keep_rejected=False)).fleet
     assert 6 not in set(dropped.traces["trace_id"]) | set(dropped.points["trace_id"])
 
 
 def test_tiles_join_without_a_seam_and_workers_change_nothing(road: Any) -> None:
     fleet = road.biased(LANES[:4], length=600.0)
     options = AlignOptions(tile=400.0, margin=100.0)
-    result = align(fleet, options)
+    result = align(fleet, options=options)
     assert result.report.tiles >= 2
     assert np.ptp(road.lateral(result.fleet, LANES[:4])) < 0.3
     move = result.fleet.traces["y"] - fleet.traces["y"]
     same = fleet.traces["trace_id"].diff() == 0
     assert move.diff()[same].abs().max() < 0.1
-    parallel = align(fleet, options, workers=2)
+    parallel = align(fleet, options=options, workers=2)
     for axis in "xyz":
         assert np.allclose(parallel.fleet.traces[axis], result.fleet.traces[axis], rtol=0.0, atol=0.01)
 
@@ -167,16 +167,16 @@ def test_tiles_join_without_a_seam_and_workers_change_nothing(road: Any) -> None
 def test_an_interrupted_run_goes_on(road: Any, tmp_path: Path) -> None:
     fleet = road.biased(LANES[:4], length=900.0)
     options = AlignOptions(tile=400.0, margin=100.0)
-    whole = align(fleet, options)
+    whole = align(fleet, options=options)
 
     def stop(stage: str, done: int, total: int) -> None:
         if done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        align(fleet, options, workspace=tmp_path / "work", progress=stop)
+        align(fleet, options=options, workspace=tmp_path / "work", progress=stop)
     assert len(list((tmp_path / "work").glob("*-moves.*"))) == 2
-    resumed = align(fleet, options, workspace=tmp_path / "work")
+    resumed = align(fleet, options=options, workspace=tmp_path / "work")
     for axis in "xyz":
         assert np.allclose(resumed.fleet.traces[axis], whole.fleet.traces[axis], rtol=0.0, atol=0.01)
 

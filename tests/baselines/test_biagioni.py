@@ -227,21 +227,21 @@ class TestRecipe:
         east = [straight(900, y, 1300, y, 41) for y in (499.0, 500.0, 501.0)]
         north = [straight(x, 300, x, 700, 41) for x in (1099.0, 1100.0, 1101.0)]
         fleet = fleet_of(*east, *north, straight(1200, 300, 1200, 480, 19))
-        graph = build_biagioni(fleet, BiagioniOptions(last_runs=True), workspace=tmp_path / "work")
+        graph = build_biagioni(fleet, options=BiagioniOptions(last_runs=True), workspace=tmp_path / "work")
         check_graph(graph)
         assert sorted(graph.degrees()) == [1, 1, 1, 1, 4]
         crossing = graph.nodes.geometry[graph.degrees() == 4].iloc[0]
         assert np.hypot(crossing.x - 1100, crossing.y - 500) < 2.0
         assert set(graph.edges["support"]) == {3}
         assert graph.length == pytest.approx(800, abs=60)
-        again = build_biagioni(fleet, BiagioniOptions(last_runs=True), workspace=tmp_path / "work")
+        again = build_biagioni(fleet, options=BiagioniOptions(last_runs=True), workspace=tmp_path / "work")
         assert again.length == pytest.approx(graph.length)
 
     def test_carriageways_stay_apart_with_the_settings_for_fleet_data_only(self) -> None:
         drives = [straight(900, y + d, 1300, y + d, 41) for y in (500.0, 512.0) for d in (-0.5, 0.0, 0.5)]
         fleet = fleet_of(*drives)
-        assert build_biagioni(fleet, FLEET).length == pytest.approx(800, abs=60)
-        published = build_biagioni(fleet, BiagioniOptions(last_runs=True))
+        assert build_biagioni(fleet, options=FLEET).length == pytest.approx(800, abs=60)
+        published = build_biagioni(fleet, options=BiagioniOptions(last_runs=True))
         assert published.length == pytest.approx(400, abs=40)
 
     def test_one_trip_is_no_road(self) -> None:

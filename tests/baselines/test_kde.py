@@ -176,21 +176,21 @@ class TestRecipe:
     ]
 
     def test_bridge_passes_over(self, tmp_path: Path) -> None:
-        graph = build_kde(fleet_of(*self.drives), KdeOptions(threshold=2.0), workspace=tmp_path / "work")
+        graph = build_kde(fleet_of(*self.drives), options=KdeOptions(threshold=2.0), workspace=tmp_path / "work")
         check_graph(graph)
         assert sorted(graph.degrees()) == [1, 1, 1, 1]
         assert graph.length == pytest.approx(400, abs=20)
         heights = sorted(line.coords[0][2] for line in graph.edges.geometry)
         assert np.abs(np.array(heights) - [10, 22]).max() <= 1.5
-        again = build_kde(fleet_of(*self.drives), KdeOptions(threshold=2.0), workspace=tmp_path / "work")
+        again = build_kde(fleet_of(*self.drives), options=KdeOptions(threshold=2.0), workspace=tmp_path / "work")
         assert again.length == pytest.approx(graph.length)
 
     def test_without_altitudes_the_roads_cross(self) -> None:
         flat = fleet_of(*[[(x, y, np.nan) for x, y, _ in drive] for drive in self.drives])
-        assert sorted(build_kde(flat, KdeOptions(threshold=2.0)).degrees()) == [1, 1, 1, 1, 4]
+        assert sorted(build_kde(flat, options=KdeOptions(threshold=2.0)).degrees()) == [1, 1, 1, 1, 4]
 
     def test_too_few_traces_give_no_road(self) -> None:
-        assert len(build_kde(fleet_of(self.drives[0]), KdeOptions(threshold=2.0)).edges) == 0
+        assert len(build_kde(fleet_of(self.drives[0]), options=KdeOptions(threshold=2.0)).edges) == 0
 
     def test_bad_options(self) -> None:
         with pytest.raises(OptionError, match="sigma is 0"):

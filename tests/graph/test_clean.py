@@ -248,7 +248,7 @@ class TestCleanGraph:
 
     def test_all_limits_at_zero_only_merge(self) -> None:
         graph = graph_of([(0, 0), (1, 0)], [(1, 0), (1, 1)], [(1, 0), (2, 0)])
-        assert clean_graph(graph, CleanOptions(short_edge=0, dead_end=0, component=0)) is graph
+        assert clean_graph(graph, options=CleanOptions(short_edge=0, dead_end=0, component=0)) is graph
 
     def test_empty_graph(self) -> None:
         assert len(clean_graph(empty_graph(UTM)).edges) == 0

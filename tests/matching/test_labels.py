@@ -16,7 +16,7 @@ from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.matching import osrm as osrm_module
-from probe2road.matching.labels import LabelOptions, cut_reference, label_reference
+from probe2road.matching.labels import LabelOptions, cut_reference, label
 from probe2road.matching.osrm import OsrmOptions, find_osrm, osrm_network, osrm_segments, osrm_server
 from probe2road.raster.grid import Grid
 from probe2road.raster.lines import label_mask
@@ -72,23 +72,23 @@ def kept(labels: RoadGraph) -> list[tuple[int, int]]:
 
 def test_pieces_that_four_traces_drive_are_kept(tee: RoadGraph, options: LabelOptions) -> None:
     data = fleet(*[road((0, 1), (500, 1))] * 3, road((0, 1), (370, 1)), road((200, 90), (200, 0), (0, 0)))
-    labels = label_reference(tee, data, options=options)
+    labels = label(tee, data, options=options)
     check_graph(labels)
     # The last of three pieces between 200 m and 500 m has three traces; the fourth ends halfway through the second.
     assert kept(labels) == [(0, 5), (0, 5), (1, 4), (1, 4)]
     assert set(labels.nodes.index) == set(np.unique(labels.edges[["u", "v"]]))
     assert labels.turns.empty
-    assert kept(label_reference(tee, data, options=replace(options, min_traces=1)))[-1] == (2, 1)
+    assert kept(label(tee, data, options=replace(options, min_traces=1)))[-1] == (2, 1)
 
 
 def test_a_trace_counts_once_however_often_it_comes(tee: RoadGraph) -> None:
     to_and_fro = road(*[(x, 0) for x in (0, 190, 10, 190, 10, 190)])
-    assert kept(label_reference(tee, fleet(to_and_fro), options=LabelOptions(min_traces=1))) == [(0, 1), (0, 1)]
+    assert kept(label(tee, fleet(to_and_fro), options=LabelOptions(min_traces=1))) == [(0, 1), (0, 1)]
 
 
 def test_the_same_stretch_twice_is_not_half_a_piece(tee: RoadGraph) -> None:
     there_and_back = road((165, 0), (199, 0), (165, 0))
-    assert label_reference(tee, fleet(there_and_back), options=LabelOptions(min_traces=1)).edges.empty
+    assert label(tee, fleet(there_and_back), options=LabelOptions(min_traces=1)).edges.empty
 
 
 def test_pieces_are_between_half_and_whole() -> None:
@@ -106,7 +106,7 @@ def test_own_labels_are_true_on_a_simulated_interchange() -> None:
     result = simulate(
         generate_interchange("diamond", rng=np.random.default_rng(1)), preset="mixed", n_drives=12, seed=1
     )
-    labels = label_reference(result.reference, result.fleet)
+    labels = label(result.reference, result.fleet)
     truth = result.reference.edges["support"]
     driven = labels.edges["reference_edge"].map(truth) >= 4
     assert labels.edges["length"][driven].sum() > 0.98 * labels.length
@@ -149,7 +149,7 @@ def test_bad_options_and_crs(tee: RoadGraph) -> None:
     with pytest.raises(OptionError, match="overlap"):
         OsrmOptions(chunk=5)
     with pytest.raises(CRSError):
-        label_reference(tee.to_crs("EPSG:32617"), fleet(road((0, 0), (200, 0))))
+        label(tee.to_crs("EPSG:32617"), fleet(road((0, 0), (200, 0))))
     grid = Grid.from_bounds(tee.bounds, crs="EPSG:32617")
     with pytest.raises(CRSError):
         label_mask(tee, grid)
@@ -161,7 +161,7 @@ def test_missing_osrm_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tee: R
     monkeypatch.delenv("PROBE2ROAD_OSRM", raising=False)
     monkeypatch.setattr(osrm_module.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"pip install 'probe2road\[osrm\]'"):
-        label_reference(tee, fleet(road((0, 0), (200, 0))), options=LabelOptions(matcher="osrm"))
+        label(tee, fleet(road((0, 0), (200, 0))), options=LabelOptions(matcher="osrm"))
     monkeypatch.setenv("PROBE2ROAD_OSRM", "/nowhere")
     with pytest.raises(InputError, match="osrm-routed"):
         find_osrm()
@@ -169,7 +169,7 @@ def test_missing_osrm_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tee: R
 
 @pytest.mark.parametrize("matcher", ["own", "osrm"])
 def test_empty_reference_has_no_labels(matcher: str) -> None:
-    labels = label_reference(empty_graph(CRS), fleet(road((0, 0), (200, 0))), options=LabelOptions(matcher=matcher))
+    labels = label(empty_graph(CRS), fleet(road((0, 0), (200, 0))), options=LabelOptions(matcher=matcher))
     assert labels.edges.empty
     assert label_mask(labels, Grid.from_bounds((0, 0, 9, 9), crs=CRS)).sum() == 0
 
@@ -177,7 +177,7 @@ def test_empty_reference_has_no_labels(matcher: str) -> None:
 def test_server_that_is_not_there(tee: RoadGraph) -> None:
     options = LabelOptions(matcher="osrm", osrm_url="http://127.0.0.1:9")
     with pytest.raises(InputError, match="cannot be reached"):
-        label_reference(tee, fleet(road((0, 0), (200, 0))), options=options)
+        label(tee, fleet(road((0, 0), (200, 0))), options=options)
 
 
 def test_segments_are_found_in_either_order(tee: RoadGraph) -> None:
@@ -214,8 +214,8 @@ def test_one_way_roads_are_closed_to_osrm(osrm: Path) -> None:
     graph = graph_from_lines(TEE[:2], crs=CRS, attributes=pd.DataFrame({"oneway": ["yes", "yes"]}))
     against = fleet(*[road((500, 1), (0, 1))] * 4)
     options = LabelOptions(matcher="osrm", osrm_folder=osrm)
-    closed = label_reference(graph, against, options=options)
-    opened = label_reference(graph, against, options=replace(options, osrm=OsrmOptions(respect_oneway=False)))
+    closed = label(graph, against, options=options)
+    opened = label(graph, against, options=replace(options, osrm=OsrmOptions(respect_oneway=False)))
     assert closed.length < opened.length == pytest.approx(500.0)
 
 

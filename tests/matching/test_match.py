@@ -59,7 +59,7 @@ def test_every_turn_of_a_crossing(
     profile: str, corners: list[tuple[float, float]], edges: list[tuple[int, bool]]
 ) -> None:
     graph = graph_from_lines(CROSSING, crs=CRS)
-    found = match(fleet(along(*corners) + 2.0), graph, MatchOptions(profile=profile))
+    found = match(graph, fleet(along(*corners) + 2.0), options=MatchOptions(profile=profile))
     assert driven(found) == edges
     turns = turn_counts(found, graph)
     centre = int(graph.edges["v"].iloc[0])
@@ -69,7 +69,7 @@ def test_every_turn_of_a_crossing(
 
 def test_steps_say_where_a_traversal_begins_and_ends() -> None:
     graph = graph_from_lines(CROSSING, crs=CRS)
-    found = match(fleet(along((-190, 0), (190, 0))), graph)
+    found = match(graph, fleet(along((-190, 0), (190, 0))))
     assert found.steps[["entered", "left"]].to_numpy().tolist() == [[False, True], [True, False]]
     assert found.steps["via_node"].isna().tolist() == [True, False]
     assert found.steps["t_first"].iloc[0] == found.fixes["t"].iloc[0]
@@ -85,7 +85,7 @@ def test_steps_say_where_a_traversal_begins_and_ends() -> None:
 def test_offsets_run_from_u_whichever_way_the_edge_is_driven() -> None:
     graph = graph_from_lines([[(0, 0), (100, 0)]], crs=CRS)
     for xy in ([(20, 1), (50, 1), (80, 1)], [(80, 1), (50, 1), (20, 1)]):
-        found = match(fleet(xy), graph)
+        found = match(graph, fleet(xy))
         assert found.fixes["offset"].tolist() == [x for x, _ in xy]
         assert found.fixes["distance"].tolist() == [1.0, 1.0, 1.0]
         assert found.fixes["forward"].eq(xy[0][0] == 20).all()
@@ -96,7 +96,7 @@ def test_parallel_carriageways_are_told_apart(side: float) -> None:
     graph = graph_from_lines([[(0, 0), (800, 0)], [(800, 12), (0, 12)]], crs=CRS)
     rng = np.random.default_rng(0)
     xy = along((10, side), (790, side), spacing=15.0)
-    found = match(fleet(xy + rng.normal(0, 2.0, xy.shape)), graph)
+    found = match(graph, fleet(xy + rng.normal(0, 2.0, xy.shape)))
     assert found.fixes["edge"].eq(0 if side == 0 else 1).all()
 
 
@@ -104,14 +104,14 @@ def test_oneway_closes_the_other_way() -> None:
     lines = [[(0, 0), (400, 0)], [(0, 6), (400, 6)]]
     graph = graph_from_lines(lines, crs=CRS, attributes=pd.DataFrame({"oneway": ["-1", "yes"]}))
     xy = along((10, 2), (390, 2))
-    assert driven(match(fleet(xy), graph)) == [(1, True)]
-    assert driven(match(fleet(xy), graph, MatchOptions(respect_oneway=False))) == [(0, True)]
+    assert driven(match(graph, fleet(xy))) == [(1, True)]
+    assert driven(match(graph, fleet(xy), options=MatchOptions(respect_oneway=False))) == [(0, True)]
 
 
 def test_the_heading_column_tells_a_standing_vehicle_from_the_cross_street() -> None:
     graph = graph_from_lines(CROSSING, crs=CRS)
     for heading, edge in ((90.0, {0}), (0.0, {2})):
-        found = match(fleet([(-2.0, -2.0)] * 3, heading=heading), graph)
+        found = match(graph, fleet([(-2.0, -2.0)] * 3, heading=heading))
         assert set(found.fixes["edge"]) == edge
         assert found.fixes["forward"].all()
 
@@ -135,14 +135,14 @@ def test_altitude_tells_stacked_roads_apart_whatever_the_bias(height: float, dri
     # The roads are level and agree about the altitude before they meet: the bias is learnt there.
     places = np.concatenate([before, xy])
     z = np.concatenate([np.zeros(len(before)), np.full(len(x), height)]) + drift + rng.normal(0, 0.7, len(places))
-    found = match(fleet(places, z=z), graph)
+    found = match(graph, fleet(places, z=z))
     assert found.fixes["edge"].eq(0 if height == 0 else 1).mean() > 0.95
 
 
 def test_short_edges_between_fixes_are_on_the_path() -> None:
     x = [0.0, 50.0, 53.0, 54.0, 56.0, 60.0, 160.0]
     graph = graph_from_lines([[(a, 0), (b, 0)] for a, b in pairwise(x)], crs=CRS)
-    found = match(fleet(along((5, 1), (155, 1), spacing=25.0)), graph)
+    found = match(graph, fleet(along((5, 1), (155, 1), spacing=25.0)))
     assert [edge for edge, _ in driven(found)] == [0, 1, 2, 3, 4, 5]
     assert found.steps["t_first"].isna().tolist() == [False, True, True, False, True, False]
     assert turn_counts(found, graph)["count"].tolist() == [1] * 5
@@ -152,7 +152,7 @@ def test_loops_and_parallel_edges_are_distinguished() -> None:
     ring = [(100, 0), (150, 50), (200, 0), (150, -50), (100, 0)]
     lines = [[(0, 0), (100, 0)], ring, [(0, 0), (50, 40), (100, 0)]]
     graph = graph_from_lines(lines, crs=CRS)
-    found = match(fleet(along((5, 4), (50, 40), (100, 0), (150, 50), (200, 0), (150, -50), (100, 0), (10, 0))), graph)
+    found = match(graph, fleet(along((5, 4), (50, 40), (100, 0), (150, 50), (200, 0), (150, -50), (100, 0), (10, 0))))
     assert driven(found) == [(2, True), (1, True), (0, False)]
     node = int(graph.edges["v"].iloc[0])
     assert turn_counts(found, graph).to_numpy().tolist() == [[1, node, 0, 1], [2, node, 1, 1]]
@@ -165,14 +165,14 @@ def test_weights_decide_between_equal_ways() -> None:
     for dear in (1, 2):
         weights = pd.Series(1.0, index=graph.edges.index)
         weights[dear] = 0.1
-        assert driven(match(trace, graph, edge_weights=weights))[1] == (3 - dear, True)
+        assert driven(match(graph, trace, edge_weights=weights))[1] == (3 - dear, True)
     with pytest.raises(InputError, match=r"edge_weights: 2 of 4 edges have no positive weight \(edge 1: nan\)"):
-        match(trace, graph, edge_weights=pd.Series([1.0, np.nan, 0.0, 1.0]))
+        match(graph, trace, edge_weights=pd.Series([1.0, np.nan, 0.0, 1.0]))
 
 
 def test_a_stretch_off_the_network_parts_the_path() -> None:
     graph = graph_from_lines([[(0, 0), (300, 0)], [(300, 0), (900, 0)]], crs=CRS)
-    found = match(fleet(along((10, 0), (290, 0), (290, 300), (500, 300), (500, 0), (890, 0))), graph)
+    found = match(graph, fleet(along((10, 0), (290, 0), (290, 300), (500, 300), (500, 0), (890, 0))))
     assert found.steps["part"].tolist() == [0, 1]
     assert found.steps["entered"].tolist() == [False, False]
     assert found.fixes["reason"].dropna().isin(["no edge within 60 m", "edges near, but none fits"]).all()
@@ -183,7 +183,7 @@ def test_a_stretch_off_the_network_parts_the_path() -> None:
 def test_a_trace_without_an_edge_near() -> None:
     graph = graph_from_lines([[(0, 0), (100, 0)]], crs=CRS)
     for profile, words in (("fleet", "within 60 m"), ("sparse", "within 80 m"), ("published", "within 150 m")):
-        found = match(fleet(along((0, 900), (100, 900))), graph, MatchOptions(profile=profile))
+        found = match(graph, fleet(along((0, 900), (100, 900))), options=MatchOptions(profile=profile))
         assert found.fixes["edge"].isna().all()
         assert found.fixes["reason"].eq(f"no edge {words}").all()
         assert found.steps.empty
@@ -192,7 +192,7 @@ def test_a_trace_without_an_edge_near() -> None:
 
 @pytest.mark.parametrize("profile", ["auto", "published"])
 def test_an_empty_graph_matches_nothing(profile: str) -> None:
-    found = match(fleet([(0, 0), (9, 0)]), empty_graph(CRS), MatchOptions(profile=profile))
+    found = match(empty_graph(CRS), fleet([(0, 0), (9, 0)]), options=MatchOptions(profile=profile))
     assert found.fixes["reason"].tolist() == ["the graph has no edges"] * 2
     assert found.steps.empty
 
@@ -200,7 +200,7 @@ def test_an_empty_graph_matches_nothing(profile: str) -> None:
 @pytest.mark.parametrize("profile", ["auto", "sparse", "published"])
 def test_a_trace_of_one_fix(profile: str) -> None:
     graph = graph_from_lines([[(0, 0), (100, 0)]], crs=CRS)
-    found = match(fleet([(30, 5)]), graph, MatchOptions(profile=profile))
+    found = match(graph, fleet([(30, 5)]), options=MatchOptions(profile=profile))
     assert found.fixes[["edge", "offset", "distance"]].to_numpy().tolist() == [[0, 30.0, 5.0]]
     assert driven(found) == [(0, True)]
 
@@ -211,7 +211,7 @@ def test_edges_without_length_are_passed(profile: str) -> None:
     lines = shapely.linestrings([[(0, 0), (100, 0)], [(100, 0), (100, 0)], [(100, 0), (200, 0)]])
     edges = gpd.GeoDataFrame({"u": [0, 1, 2], "v": [1, 2, 3]}, geometry=lines, crs=CRS)
     graph = RoadGraph(nodes, finish_edges(edges), empty_turns())
-    found = match(fleet(along((5, 1), (195, 1), spacing=5.0)), graph, MatchOptions(profile=profile))
+    found = match(graph, fleet(along((5, 1), (195, 1), spacing=5.0)), options=MatchOptions(profile=profile))
     edge = [edge for edge, _ in driven(found)]
     assert edge == [0, 1, 2] or profile == "published"  # which passes one state for each observation
     assert {edge[0], edge[-1]} == {0, 2}
@@ -220,20 +220,20 @@ def test_edges_without_length_are_passed(profile: str) -> None:
 def test_missing_altitudes_change_nothing() -> None:
     graph = stacked_roads()
     xy = along((10, 30), (190, 30))
-    plain = match(fleet(xy), graph)
+    plain = match(graph, fleet(xy))
     for z in (np.nan, np.where(np.arange(len(xy)) % 2, np.nan, 0.0)):
-        assert match(fleet(xy, z=z), graph).fixes.equals(plain.fixes)
+        assert match(graph, fleet(xy, z=z)).fixes.equals(plain.fixes)
 
 
 def test_another_crs_is_refused() -> None:
     graph = graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32617")
     with pytest.raises(CRSError, match=r"the traces are in WGS 84 / UTM zone 16N, the graph is in .* 17N; reproject"):
-        match(fleet([(0, 0), (9, 0)]), graph)
+        match(graph, fleet([(0, 0), (9, 0)]))
 
 
 def test_turns_on_another_graph_are_refused() -> None:
     graph = graph_from_lines(CROSSING, crs=CRS)
-    found = match(fleet(along((-190, 0), (190, 0))), graph)
+    found = match(graph, fleet(along((-190, 0), (190, 0))))
     with pytest.raises(InputError, match="edge 1 of the matches is not in the graph"):
         turn_counts(found, graph_from_lines(CROSSING[:1], crs=CRS))
 
@@ -243,8 +243,8 @@ def test_auto_takes_the_profile_of_the_interval() -> None:
     xy = along((-190, 3), (190, 3), spacing=20.0)
     for interval, profile in ((4.0, "fleet"), (6.0, "sparse")):
         trace = fleet(xy, interval=interval)
-        chosen = match(trace, graph, MatchOptions(profile=profile))
-        assert match(trace, graph).fixes.equals(chosen.fixes)
+        chosen = match(graph, trace, options=MatchOptions(profile=profile))
+        assert match(graph, trace).fixes.equals(chosen.fixes)
 
 
 def test_traces_of_both_profiles_in_one_fleet_keep_their_order() -> None:
@@ -255,7 +255,7 @@ def test_traces_of_both_profiles_in_one_fleet_keep_their_order() -> None:
         step = 10.0 if number % 2 else 1.0
         parts.append(pd.DataFrame({"trace_id": number, "t": step * np.arange(len(xy)), "x": xy[:, 0], "y": xy[:, 1]}))
     table = pd.concat(parts, ignore_index=True)
-    found = match(fleet_from_tables(table, crs=CRS, target_crs=CRS), graph)
+    found = match(graph, fleet_from_tables(table, crs=CRS, target_crs=CRS))
     assert found.fixes["trace_id"].tolist() == table["trace_id"].tolist()
     assert found.steps["trace_id"].tolist() == np.repeat(np.arange(6), 2).tolist()
     assert found.steps["position"].tolist() == [0, 1] * 6
@@ -325,7 +325,7 @@ def test_published_equals_viterbi_over_full_matrices(seed: int) -> None:
     xy = xy + np.cumsum(rng.normal(0, 3.0, xy.shape), axis=0)
     xy = xy[: 1 + int(np.argmax(np.append(np.hypot(*np.diff(xy, axis=0).T) > 10.0, True)))]  # no interpolated fixes
     model = PublishedModel(memory=1000)
-    found = match(fleet(xy), graph, MatchOptions(profile="published", published=model))
+    found = match(graph, fleet(xy), options=MatchOptions(profile="published", published=model))
     state = 2 * found.fixes["edge"] + (~found.fixes["forward"]).astype("Int64")
     assert state.fillna(-1).tolist() == brute_force([tuple(place) for place in xy], graph, model)
 
@@ -334,7 +334,7 @@ def test_published_decides_with_bounded_memory() -> None:
     graph = graph_from_lines(CROSSING, crs=CRS)
     xy = along((-190, 4), (0, 4), (4, 190))
     long, short = (
-        match(fleet(xy), graph, MatchOptions(profile="published", published=PublishedModel(memory=memory)))
+        match(graph, fleet(xy), options=MatchOptions(profile="published", published=PublishedModel(memory=memory)))
         for memory in (300, 25)
     )
     assert driven(long) == driven(short) == [(0, True), (3, True)]
@@ -368,7 +368,7 @@ def test_a_real_track_follows_its_true_route(interval: int) -> None:
     ends = np.unique(np.sort(arcs.astype(int), axis=1), axis=0)
     graph = graph_from_lines(shapely.linestrings(xy[ends]), crs=crs, snap=0.0)
     table = pd.DataFrame({"trace_id": 0, "t": track[:, 2], "x": track[:, 0], "y": track[:, 1]})[::interval]
-    found = match(fleet_from_tables(table, crs="EPSG:4326", target_crs=crs), graph)
+    found = match(graph, fleet_from_tables(table, crs="EPSG:4326", target_crs=crs))
     numbers = {(int(u), int(v)): edge for edge, (u, v) in enumerate(ends)}
     true = [numbers[min(u, v), max(u, v)] for u, v in arcs[route[:, 0].astype(int)].astype(int).tolist()]
     wrong = set(true) ^ set(found.steps["edge"])

@@ -23,7 +23,7 @@ def test_points_farther_than_the_snap_distance_score_zero() -> None:
     reference, proposal = ([[(0, y), (400, y)]] for y in (0.0, 5.0))
     sides = graph_from_lines(proposal, crs=CRS), graph_from_lines(reference, crs=CRS)
     assert apls(*sides).f1 == 0.0
-    assert apls(*sides, AplsOptions(snap=6.0)).f1 == 1.0
+    assert apls(*sides, options=AplsOptions(snap=6.0)).f1 == 1.0
 
 
 def test_a_detour_costs_its_relative_length() -> None:
@@ -41,7 +41,7 @@ def test_an_empty_graph_scores_zero(empty_side: int, streets: Streets) -> None:
 
 def test_the_draw_of_control_points_is_reproducible(streets: Streets) -> None:
     sides = streets(1, size=8), streets(2, size=8)
-    first, again, other = (apls(*sides, AplsOptions(snap=8.0, max_points=20, seed=seed)) for seed in (0, 0, 1))
+    first, again, other = (apls(*sides, options=AplsOptions(snap=8.0, max_points=20, seed=seed)) for seed in (0, 0, 1))
     assert first == again
     assert first.f1 != other.f1
     assert first.reference <= 190
@@ -92,6 +92,6 @@ def brute_force(graph: RoadGraph, other: RoadGraph, snap: float) -> float:
 @pytest.mark.parametrize("seed", range(3))
 def test_similarity_equals_networkx(seed: int, streets: Streets) -> None:
     proposal, reference = comparable(streets(seed, block=70.0), streets(seed + 100, block=70.0))
-    score = apls(proposal, reference, AplsOptions(snap=8.0))
+    score = apls(proposal, reference, options=AplsOptions(snap=8.0))
     assert score.recall == pytest.approx(brute_force(reference, proposal, 8.0), abs=1e-6)
     assert score.precision == pytest.approx(brute_force(proposal, reference, 8.0), abs=1e-6)

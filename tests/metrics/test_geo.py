@@ -32,7 +32,7 @@ def quarter_circle(radius: float) -> RoadGraph:
 
 
 def counts(proposal: RoadGraph, reference: RoadGraph, options: GeoOptions | None = None) -> tuple[int, int, int]:
-    score = geo(proposal, reference, options)
+    score = geo(proposal, reference, options=options)
     return int(score.matched_proposal), int(score.proposal), int(score.reference)
 
 
@@ -99,8 +99,8 @@ def test_duplicates_cost_precision_only() -> None:
 
 def test_roads_along_and_across_are_told_apart_on_request() -> None:
     proposal, reference = graph([(0, -5), (0, 5)]), graph([(-5, 0), (5, 0)])
-    assert geo(proposal, reference, GeoOptions(radius=8.0)).f1 == 1.0
-    assert geo(proposal, reference, GeoOptions(radius=8.0, max_angle=60.0)).f1 == 0.0
+    assert geo(proposal, reference, options=GeoOptions(radius=8.0)).f1 == 1.0
+    assert geo(proposal, reference, options=GeoOptions(radius=8.0, max_angle=60.0)).f1 == 0.0
 
 
 def test_scores_do_not_depend_on_how_edges_are_cut() -> None:
@@ -133,7 +133,7 @@ def test_phases_even_out_an_offset_that_is_all_or_nothing() -> None:
     lucky, unlucky = graph([(0, 4.0), (5000, 4.0)]), graph([(-5.5, 4.0), (4994.5, 4.0)])
     assert geo(lucky, reference).precision == 1.0
     assert geo(unlucky, reference).precision < 0.01
-    smooth = [geo(proposal, reference, GeoOptions(phases=11)).precision for proposal in (lucky, unlucky)]
+    smooth = [geo(proposal, reference, options=GeoOptions(phases=11)).precision for proposal in (lucky, unlucky)]
     expected = 2 * np.sqrt(36 - 16) / 11  # METHOD 6.1: the share of phases that match at 4 m
     assert smooth == pytest.approx([expected, expected], abs=0.09)
 
@@ -167,8 +167,8 @@ def test_optimal_matching_equals_an_assignment(seed: int, streets: Streets) -> N
 
 def test_the_variant_of_he_and_balakrishnan() -> None:
     reference = graph([(0, 0), (100, 0)])
-    assert geo(graph([(0, 0.9), (100, 0.9)]), reference, HE_BALAKRISHNAN_2022).f1 == 1.0
-    assert geo(graph([(0, 1.1), (100, 1.1)]), reference, HE_BALAKRISHNAN_2022).f1 == 0.0
+    assert geo(graph([(0, 0.9), (100, 0.9)]), reference, options=HE_BALAKRISHNAN_2022).f1 == 1.0
+    assert geo(graph([(0, 1.1), (100, 1.1)]), reference, options=HE_BALAKRISHNAN_2022).f1 == 0.0
 
 
 def test_parameters_stand_in_the_row() -> None:

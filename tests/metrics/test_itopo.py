@@ -79,9 +79,9 @@ def test_micro_macro_and_strict_of_one_false_crossing() -> None:
     # reference's tips 4/4/4 each.
     micro = itopo(proposal, reference)
     assert (micro.matched_proposal, micro.proposal, micro.reference) == (23, 37, 23)
-    macro = itopo(proposal, reference, ItopoOptions(average="macro"))
+    macro = itopo(proposal, reference, options=ItopoOptions(average="macro"))
     assert (macro.precision, macro.recall) == pytest.approx(((7 / 13 + 4) / 7, 1.0))
-    strict = itopo(proposal, reference, ItopoOptions(strict=True))
+    strict = itopo(proposal, reference, options=ItopoOptions(strict=True))
     assert (strict.matched_proposal, strict.proposal) == (15, 29)
     assert (strict.matched_reference, strict.reference) == (8, 8)
     assert (strict.details["proposal_nodes"], strict.details["reference_nodes"]) == (5, 2)
@@ -96,7 +96,9 @@ def test_more_nodes_raise_recall_but_not_strictly() -> None:
     stubby = graph_from_lines([*road, *stubs], crs=CRS)
     assert itopo(stubby, reference).recall > itopo(plain, reference).recall
     strict = ItopoOptions(strict=True)
-    assert itopo(stubby, reference, strict).recall == pytest.approx(itopo(plain, reference, strict).recall)
+    assert itopo(stubby, reference, options=strict).recall == pytest.approx(
+        itopo(plain, reference, options=strict).recall
+    )
 
 
 def test_the_end_of_an_edge_that_is_closed_in_is_where_its_branches_meet() -> None:

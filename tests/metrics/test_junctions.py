@@ -32,7 +32,7 @@ def counts(
     proposal: RoadGraph, reference: RoadGraph, options: JunctionOptions | None = None
 ) -> tuple[int, int, int, int]:
     """True and false positives, false negatives, arms that are not found."""
-    score = junctions(proposal, reference, options)
+    score = junctions(proposal, reference, options=options)
     both = int(score.matched_proposal)
     return both, int(score.proposal) - both, int(score.reference) - both, score.details["arms_not_found"]
 
@@ -141,7 +141,7 @@ def test_ways_equal_those_of_a_graph_cut_at_the_spots(seed: int, streets: Street
     whole, _ = comparable(streets(seed, block=80.0), streets(seed, block=80.0))
     kept = np.random.default_rng(seed).random(len(whole.edges)) < 0.8
     network, own = (network_from_graph(part) for part in (whole, replace(whole, edges=whole.edges[kept])))
-    pairs = junction_pairs(own, network, JunctionOptions(arm=1000.0, radius=0.01, max_angle=5.0))
+    pairs = junction_pairs(own, network, options=JunctionOptions(arm=1000.0, radius=0.01, max_angle=5.0))
 
     halves = nx.Graph()
     for e in np.flatnonzero(kept):

@@ -63,7 +63,7 @@ def test_a_road_across_is_no_road_beside() -> None:
 
 
 def test_the_shares_are_those_of_the_lengths() -> None:
-    score = lateral(graph([(0, 1), (100, 1)]), graph([(0, 0), (400, 0)]), LateralOptions(spacing=0.5))
+    score = lateral(graph([(0, 1), (100, 1)]), graph([(0, 0), (400, 0)]), options=LateralOptions(spacing=0.5))
     assert score.precision == 1.0
     assert score.recall == pytest.approx((100 + np.sqrt(6**2 - 1)) / 400, abs=0.002)
 
@@ -87,7 +87,7 @@ def test_an_empty_graph_scores_zero(empty_side: int, streets: Streets) -> None:
 def test_gaps_are_distances_to_the_roads(seed: int, streets: Streets) -> None:
     """Where any direction will do, a gap is the distance to the whole map, but beyond dead ends."""
     own, other = (network_from_graph(side) for side in comparable(streets(seed), streets(seed + 100)))
-    xy, gap = lateral_gaps(own, other, LateralOptions(max_angle=90.0))
+    xy, gap = lateral_gaps(own, other, options=LateralOptions(max_angle=90.0))
     distance = shapely.distance(shapely.union_all(other.lines), shapely.points(xy))
     assert (np.isfinite(gap) == (distance <= 6.0)).all()
     near = np.isfinite(gap)

@@ -43,7 +43,7 @@ def test_buffer_geo_equals_buffered_geometry(seed: int, streets: Streets) -> Non
     """The share of length inside the other map's buffer, by polygons."""
     proposal, reference = comparable(streets(seed), streets(seed + 100))
     options = BufferGeoOptions(radii=(5.0,), spacing=0.1)
-    [score] = buffer_geo(proposal, reference, options)
+    [score] = buffer_geo(proposal, reference, options=options)
     maps = [shapely.union_all(side.edges.geometry.to_numpy()) for side in (proposal, reference)]
     for share, own, other in ((score.precision, *maps), (score.recall, *maps[::-1])):
         inside = shapely.intersection(own, shapely.buffer(other, 5.0, quad_segs=64)).length
@@ -53,7 +53,7 @@ def test_buffer_geo_equals_buffered_geometry(seed: int, streets: Streets) -> Non
 def test_every_component_is_explored_from_one_root() -> None:
     """Samples every 5 m of network distance: 0, 5, 10 from (0, 0) and from (100, 0)."""
     sides = graph([(0, 0), (6, 0)], [(6, 0), (6, 7)], [(100, 0), (112, 0)])
-    [score] = graph_sampling(sides, sides, GraphSamplingOptions(radii=(5.0,)))
+    [score] = graph_sampling(sides, sides, options=GraphSamplingOptions(radii=(5.0,)))
     assert (score.proposal, score.f1) == (6, 1.0)
 
 

@@ -51,7 +51,7 @@ def test_a_partner_runs_along_the_road() -> None:
 
 def test_the_margin_leaves_out_starts_at_the_border() -> None:
     road = graph([(0, 0), (1000, 0)])
-    assert topo(road, road, TopoOptions(margin=0.07)).details["starts"] == 17
+    assert topo(road, road, options=TopoOptions(margin=0.07)).details["starts"] == 17
 
 
 @pytest.mark.parametrize("empty_side", [0, 1])

@@ -107,9 +107,9 @@ def test_merging_keeps_geometry_and_cycles(graph: RoadGraph) -> None:
 @given(graphs(), st.sampled_from([0.0, 5.0, 15.0, 40.0]))
 def test_cleaning_twice_changes_nothing(graph: RoadGraph, limit: float) -> None:
     options = CleanOptions(short_edge=limit, dead_end=limit, component=limit)
-    clean = clean_graph(graph, options)
+    clean = clean_graph(graph, options=options)
     check_graph(clean)
-    assert clean_graph(clean, options) is clean
+    assert clean_graph(clean, options=options) is clean
     degree = clean.degrees()
     loops = clean.edges.loc[clean.edges["u"] == clean.edges["v"], "u"]
     assert degree[degree == 2].index.isin(loops).all()

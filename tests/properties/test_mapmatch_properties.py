@@ -77,7 +77,7 @@ def test_a_dense_trace_along_a_path_gives_the_path(seed: int, profile: str) -> N
     rng = np.random.default_rng(seed)
     graph = random_streets(rng)
     drive = random_drive(graph, rng, 7)
-    found = match(fleet_of({"a": positions(graph, drive, 8.0)}), graph, MatchOptions(profile=profile))
+    found = match(graph, fleet_of({"a": positions(graph, drive, 8.0)}), options=MatchOptions(profile=profile))
     assert driven(found) == drive
     assert found.steps["part"].eq(0).all()
     assert found.steps["entered"].tolist() == [False] + [True] * (len(drive) - 1)
@@ -90,7 +90,7 @@ def test_reversing_a_trace_reverses_the_steps(seed: int, profile: str) -> None:
     rng = np.random.default_rng(seed)
     graph = random_streets(rng)
     xy = positions(graph, random_drive(graph, rng, 7), 8.0)
-    forth, back = (match(fleet_of({"a": way}), graph, MatchOptions(profile=profile)) for way in (xy, xy[::-1]))
+    forth, back = (match(graph, fleet_of({"a": way}), options=MatchOptions(profile=profile)) for way in (xy, xy[::-1]))
     assert driven(back) == [(edge, not forward) for edge, forward in reversed(driven(forth))]
 
 
@@ -104,11 +104,11 @@ def test_traces_do_not_influence_each_other(seed: int, profile: str) -> None:
         xy = positions(graph, random_drive(graph, rng, 6), rng.choice([8.0, 90.0]))
         places[name] = xy + rng.normal(0, 6.0, xy.shape)
     options = MatchOptions(profile=profile)
-    together = match(fleet_of(places), graph, options)
-    turned = match(fleet_of(dict(zip("cba", [places[name] for name in "abc"], strict=True))), graph, options)
+    together = match(graph, fleet_of(places), options=options)
+    turned = match(graph, fleet_of(dict(zip("cba", [places[name] for name in "abc"], strict=True))), options=options)
     for name, other in zip("abc", "cba", strict=True):
         assert driven(together, name) == driven(turned, other)
-        alone = match(fleet_of({name: places[name]}), graph, options)
+        alone = match(graph, fleet_of({name: places[name]}), options=options)
         assert driven(together, name) == driven(alone, name)
 
 
@@ -118,7 +118,7 @@ def test_steps_and_fixes_agree_whatever_the_noise(seed: int, noise: float, profi
     rng = np.random.default_rng(seed)
     graph = random_streets(rng)
     xy = positions(graph, random_drive(graph, rng, 9), 12.0)
-    found = match(fleet_of({"a": xy + rng.normal(0, noise, xy.shape)}), graph, MatchOptions(profile=profile))
+    found = match(graph, fleet_of({"a": xy + rng.normal(0, noise, xy.shape)}), options=MatchOptions(profile=profile))
     fixes, steps = found.fixes, found.steps
     assert len(fixes) == len(xy)
     assert fixes["edge"].notna().tolist() == fixes["reason"].isna().tolist()

@@ -61,7 +61,7 @@ def test_a_graph_against_itself_connects_alike_and_lies_in_place(lines: list[Any
 @given(street_lines(), street_lines())
 def test_optimal_geo_is_symmetric_and_at_least_greedy(first: list[Any], second: list[Any]) -> None:
     there, back = (
-        geo(graph(a), graph(b), GeoOptions(matching="optimal")) for a, b in ((first, second), (second, first))
+        geo(graph(a), graph(b), options=GeoOptions(matching="optimal")) for a, b in ((first, second), (second, first))
     )
     assert (there.precision, there.recall) == (back.recall, back.precision)
     assert there.matched_proposal >= geo(graph(first), graph(second)).matched_proposal
@@ -98,7 +98,8 @@ def test_cutting_edges_changes_nothing(lines: list[Any], data: st.DataObject) ->
 @given(street_lines(), street_lines(), st.floats(1.0, 20.0), st.floats(1.0, 20.0))
 def test_a_larger_radius_never_matches_less(first: list[Any], second: list[Any], a: float, b: float) -> None:
     near, far = (
-        geo(graph(first), graph(second), GeoOptions(radius=radius, matching="optimal")) for radius in sorted((a, b))
+        geo(graph(first), graph(second), options=GeoOptions(radius=radius, matching="optimal"))
+        for radius in sorted((a, b))
     )
     assert near.matched_proposal <= far.matched_proposal
     assert np.isfinite(far.f1)

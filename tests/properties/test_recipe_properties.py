@@ -41,7 +41,7 @@ def tables(draw):
 
 
 def graph_of(table, options=OPTIONS):
-    return build(fleet_from_tables(table, crs=CRS, target_crs=CRS), options)
+    return build(fleet_from_tables(table, crs=CRS, target_crs=CRS), options=options)
 
 
 def same(first, second, *, shift=(0.0, 0.0)):
@@ -88,8 +88,8 @@ def test_the_crs_that_the_traces_come_in_does_not_matter(other):
     x, y = transform(table["x"].to_numpy(), table["y"].to_numpy(), here.crs, parse_crs(other))
     there = fleet_from_tables(table.assign(x=x, y=y), crs=other, target_crs=CRS)
     assert np.abs(here.traces[["x", "y"]].to_numpy() - there.traces[["x", "y"]].to_numpy()).max() < 0.01
-    first = shapely.get_coordinates(build(here, OPTIONS).edges.geometry.segmentize(1.0))
-    second = build(there, OPTIONS).edges.geometry.to_numpy()
+    first = shapely.get_coordinates(build(here, options=OPTIONS).edges.geometry.segmentize(1.0))
+    second = build(there, options=OPTIONS).edges.geometry.to_numpy()
     # A fix that changes pixels moves the graph by centimetres around it, and no farther.
     apart = shapely.distance(shapely.points(first), shapely.union_all(second))
     assert np.median(apart) < 0.01

@@ -32,7 +32,7 @@ def fleet(lines: list[list[tuple[float, float]]], points: pd.DataFrame | None = 
 
 
 def refined(graph: RoadGraph, data: Fleet, **options: float) -> RoadGraph:
-    result = refine_centreline(graph, data, match(data, graph), options=CentrelineOptions(**options))
+    result = refine_centreline(graph, data, match(graph, data), options=CentrelineOptions(**options))
     check_graph(result)
     return result
 
@@ -122,7 +122,7 @@ def test_nothing_to_do() -> None:
 def test_wrong_crs_and_options_are_refused() -> None:
     graph, data = graph_from_lines([[(0, 0), (600, 0)]], crs=CRS), fleet([[(0, 0), (600, 0)]])
     with pytest.raises(CRSError):
-        refine_centreline(graph.to_crs("EPSG:32617"), data, match(data, graph))
+        refine_centreline(graph.to_crs("EPSG:32617"), data, match(graph, data))
     for wrong in ({"spacing": 0.0}, {"max_shift": -1.0}, {"reach": float("nan")}):
         with pytest.raises(OptionError, match=next(iter(wrong))):
             CentrelineOptions(**wrong)

@@ -49,7 +49,7 @@ def fleet(*drives: pd.DataFrame) -> Fleet:
 
 
 def known(graph: RoadGraph, data: Fleet, **options: Any) -> RoadGraph:
-    return add_evidence(graph, data, match(data, graph), options=EvidenceOptions(**options))
+    return add_evidence(graph, data, match(graph, data), options=EvidenceOptions(**options))
 
 
 @pytest.fixture
@@ -204,7 +204,7 @@ def test_inputs_are_not_changed(tee: RoadGraph) -> None:
 
 def test_wrong_matches_and_crs_are_refused(tee: RoadGraph) -> None:
     data = fleet(drive((0, 0), (400, 0)))
-    found = match(data, tee)
+    found = match(tee, data)
     with pytest.raises(InputError, match="the fleet has 20"):
         add_evidence(tee, fleet(drive((0, 0), (200, 0))), found)
     with pytest.raises(InputError, match="edge 1 of the matches is not in the graph"):
@@ -225,7 +225,7 @@ def test_a_trace_lost_on_an_edge_traversed_it_once(tee: RoadGraph) -> None:
     first, second = drive((0, 0), (70, 0)), drive((130, 0), (200, 0), start="2024-01-01 00:00:13")
     aside = drive((70, 300), (130, 300), start="2024-01-01 00:00:07")
     data = fleet(first, aside, second)
-    driven, _ = frame(tee, data, match(data, tee))
+    driven, _ = frame(tee, data, match(tee, data))
     assert driven.edge.tolist() == [0]
     assert (driven.low.tolist(), driven.high.tolist()) == ([5.0], [195.0])
 

@@ -10,7 +10,7 @@ from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.refinement.gaps.fill import GapOptions
-from probe2road.refinement.recipe import RefineOptions, refine_graph
+from probe2road.refinement.recipe import RefineOptions, refine
 
 CRS = "EPSG:32616"
 # A road on a bridge over two others, whose mask is lost between them and has grown into both.
@@ -33,7 +33,7 @@ def drives(n: int = 6) -> Fleet:
 
 
 def refined(graph: RoadGraph, **gaps: float) -> RoadGraph:
-    result = refine_graph(graph, drives(), RefineOptions(gaps=GapOptions(**gaps)))
+    result = refine(graph, drives(), options=RefineOptions(gaps=GapOptions(**gaps)))
     check_graph(result)
     return result
 

@@ -38,7 +38,7 @@ def rows_of(probability, threshold=0.5):
 def test_a_busy_road_does_not_swallow_its_quiet_neighbour():
     counts = np.zeros((81, 200), np.uint32)
     counts[25], counts[55] = 300, 1
-    probability = density_probability(counts, grid_of(*counts.shape), DensityOptions(bandwidth=5.0))
+    probability = density_probability(counts, grid_of(*counts.shape), options=DensityOptions(bandwidth=5.0))
     assert rows_of(probability) == 2
     assert probability[25, 100] == probability[:, 100].max()
     assert probability[40, 100] == 0.0
@@ -49,7 +49,7 @@ def test_the_probability_of_a_road_does_not_depend_on_how_busy_it_is_but_grows_w
     for n in (1, 2, 5, 50):
         counts = np.zeros((61, 100), np.uint32)
         counts[30] = n
-        levels.append(density_probability(counts, grid_of(61, 100), DensityOptions(bandwidth=4.0))[30, 50])
+        levels.append(density_probability(counts, grid_of(61, 100), options=DensityOptions(bandwidth=4.0))[30, 50])
     assert levels == sorted(levels)
     assert levels[0] == pytest.approx(0.5, abs=0.01)
     assert levels[1] == pytest.approx(np.log2(3) / (np.log2(3) + 1), abs=0.01)
@@ -59,7 +59,7 @@ def test_the_probability_of_a_road_does_not_depend_on_how_busy_it_is_but_grows_w
 def test_windows_with_a_halo_agree_with_the_whole():
     fleet = fleet_of_lines([0.0, 40.0, 90.0], 4, noise=3.0)
     grid = fleet_grid(fleet)
-    segmenter = density_segmenter(fleet, grid, DensityOptions(bandwidth=6.0))
+    segmenter = density_segmenter(fleet, grid, options=DensityOptions(bandwidth=6.0))
     whole = segmenter.predict(rasterize(fleet, grid), grid)
     for window, counts in rasterize_windows(fleet, grid, size=97, halo=segmenter.halo):
         part = segmenter.predict(counts, window.grid(grid))[window.inner]
@@ -73,7 +73,7 @@ def test_windows_with_a_halo_agree_with_the_whole():
 
 def test_no_traces_give_no_road():
     counts = np.zeros((50, 50), np.uint32)
-    assert not density_probability(counts, grid_of(50, 50), DensityOptions(bandwidth=5.0)).any()
+    assert not density_probability(counts, grid_of(50, 50), options=DensityOptions(bandwidth=5.0)).any()
 
 
 @pytest.mark.parametrize(
@@ -86,4 +86,4 @@ def test_options_that_mean_nothing_are_refused(options):
 
 def test_a_bandwidth_is_needed():
     with pytest.raises(OptionError, match="density_segmenter"):
-        density_probability(np.zeros((5, 5), np.uint32), grid_of(5, 5), DensityOptions())
+        density_probability(np.zeros((5, 5), np.uint32), grid_of(5, 5), options=DensityOptions())

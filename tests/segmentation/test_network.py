@@ -44,7 +44,7 @@ def options(path, **changes):
 
 
 def test_a_crossing_comes_out(fleet, write_weights):
-    graph = build(fleet, options(write_weights(GNSS)))
+    graph = build(fleet, options=options(write_weights(GNSS)))
     assert sorted(graph.degrees()) == [1, 1, 1, 1, 4]
     assert graph.length == pytest.approx(4 * 400, abs=40)
 
@@ -66,7 +66,7 @@ def test_tiles_agree_with_the_whole(fleet, write_weights):
 
 def test_a_run_goes_on_where_it_stopped(fleet, write_weights, tmp_path, monkeypatch):
     chosen = options(write_weights(GNSS))
-    whole = build(fleet, chosen)
+    whole = build(fleet, options=chosen)
     from probe2road import recipe
 
     calls, predict = [], recipe.predict_window
@@ -79,9 +79,9 @@ def test_a_run_goes_on_where_it_stopped(fleet, write_weights, tmp_path, monkeypa
 
     monkeypatch.setattr("probe2road.recipe.predict_window", counting)
     with pytest.raises(KeyboardInterrupt):
-        build(fleet, chosen, workspace=tmp_path / "work")
+        build(fleet, options=chosen, workspace=tmp_path / "work")
     assert len(list((tmp_path / "work").glob("window-*.npz"))) == 4
-    graph = build(fleet, chosen, workspace=tmp_path / "work")
+    graph = build(fleet, options=chosen, workspace=tmp_path / "work")
     assert calls[4] == calls[5]
     assert len(calls) - 1 == len(set(calls)) > 8
     assert graph.edges.geometry.geom_equals_exact(whole.edges.geometry, 0.0).all()
@@ -90,10 +90,10 @@ def test_a_run_goes_on_where_it_stopped(fleet, write_weights, tmp_path, monkeypa
 
 def test_other_weights_in_the_same_file_start_a_run_afresh(fleet, write_weights, tmp_path, caplog):
     chosen = options(write_weights(GNSS))
-    build(fleet, chosen, workspace=tmp_path / "work")
+    build(fleet, options=chosen, workspace=tmp_path / "work")
     write_weights(GNSS, threshold=0.4)
     with caplog.at_level(logging.INFO):
-        build(fleet, chosen, workspace=tmp_path / "work")
+        build(fleet, options=chosen, workspace=tmp_path / "work")
     assert "starting afresh" in caplog.text
 
 
@@ -115,7 +115,7 @@ def test_an_installation_without_weights_says_so(monkeypatch, tmp_path):
 
 def test_weights_that_look_at_points_need_points(fleet, write_weights):
     with pytest.raises(InputError, match="looks at traces, lane_markings, road_boundaries, and the fleet has no sem"):
-        build(fleet, options(write_weights()))
+        build(fleet, options=options(write_weights()))
 
 
 def test_weights_for_traces_serve_fleets_with_points(write_weights):
@@ -126,7 +126,7 @@ def test_weights_for_traces_serve_fleets_with_points(write_weights):
 
 def test_weights_that_look_at_an_unknown_channel_are_refused(fleet, write_weights):
     with pytest.raises(InputError, match=r"weights\.onnx: no raster has the channels heading; use --segmenter density"):
-        build(fleet, options(write_weights(("traces", "heading"))))
+        build(fleet, options=options(write_weights(("traces", "heading"))))
 
 
 def test_a_raster_with_too_few_channels_is_refused(fleet, write_weights):
@@ -138,7 +138,7 @@ def test_a_raster_with_too_few_channels_is_refused(fleet, write_weights):
 
 def test_another_resolution_is_refused(fleet, write_weights):
     with pytest.raises(OptionError, match=r"pixels of 1\.0 m, the raster has 0\.5 m; use --resolution 1\.0"):
-        build(fleet, replace(options(write_weights(GNSS)), resolution=0.5))
+        build(fleet, options=replace(options(write_weights(GNSS)), resolution=0.5))
 
 
 def test_an_all_zero_raster_has_no_roads(fleet, write_weights):

@@ -46,8 +46,8 @@ class _Run:
 
 def align(
     fleet: Fleet,
-    options: AlignOptions | None = None,
     *,
+    options: AlignOptions | None = None,
     workspace: str | Path | None = None,
     workers: int = 1,
     progress: Progress | None = None,
@@ -101,8 +101,8 @@ def align(
 def add_drives(
     aligned: Fleet,
     new: Fleet,
-    options: AlignOptions | None = None,
     *,
+    options: AlignOptions | None = None,
     workspace: str | Path | None = None,
     workers: int = 1,
     progress: Progress | None = None,

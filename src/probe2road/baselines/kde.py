@@ -51,8 +51,8 @@ class KdeOptions:
 
 def build_kde(
     fleet: Fleet,
-    options: KdeOptions | None = None,
     *,
+    options: KdeOptions | None = None,
     workspace: str | Path | None = None,
     progress: Progress | None = None,
 ) -> RoadGraph:
@@ -114,7 +114,7 @@ def build_kde(
     )
     work.write_graph("1-vectorized", graph)
     if options.clean is not None:
-        graph = clean_graph(graph, options.clean)
+        graph = clean_graph(graph, options=options.clean)
     work.write_graph("2-roads", graph)
     report("graph", 1, 1)
     return graph

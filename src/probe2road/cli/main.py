@@ -119,7 +119,7 @@ def build(
     fleet = _read_fleet(traces, points, columns, point_columns, crs, bbox, delimiter, no_header, work_crs)
     workspace = keep_intermediate or output[0].parent / f".{output[0].name}.probe2road"
     with progress_bar() as progress:
-        graph = build_graph(fleet, options, workspace=workspace, progress=progress)
+        graph = build_graph(fleet, options=options, workspace=workspace, progress=progress)
     for path in output:
         write_graph(graph, path)
     if keep_intermediate:
@@ -164,7 +164,9 @@ def align(
     workspace = output.parent / f".{output.name}.probe2road"
     with progress_bar() as progress:
         kept: dict[str, Any] = {"workspace": workspace, "workers": workers, "progress": progress}
-        result = add_drives(base, fleet, options, **kept) if base else align_fleet(fleet, options, **kept)
+        result = (
+            add_drives(base, fleet, options=options, **kept) if base else align_fleet(fleet, options=options, **kept)
+        )
     write_fleet(result.fleet, output)
     if report:
         write_report(result.report, report)
@@ -199,7 +201,7 @@ def match(
     roads = read_graph(graph)
     work_crs = roads.crs.to_wkt()
     fleet = _read_fleet([traces], None, columns, None, crs, bbox, delimiter, no_header, work_crs)
-    matches = match_fleet(fleet, roads, options)
+    matches = match_fleet(roads, fleet, options=options)
     for path, table in ((output, matches.fixes), (steps, matches.steps)):
         if path is not None:
             with atomic_path(path) as temporary:
@@ -270,7 +272,7 @@ def view(
     no_header: NoHeader = False,
 ) -> None:
     """Draw a road graph over its traces: one HTML page that needs no network, or a picture."""
-    from probe2road.draw.page import write_view
+    from probe2road.draw.page import view
     from probe2road.draw.picture import draw_graph
     from probe2road.io.graph_files import read_graph
 
@@ -285,7 +287,7 @@ def view(
     if output.suffix.lower() == ".png":
         draw_graph(roads, output, fleet=fleet, reference=read_graph(reference) if reference else None)
     else:
-        write_view(roads, output, traces=fleet, title=title or graph.name)
+        view(roads, output, fleet=fleet, title=title or graph.name)
 
 
 @app.command()

@@ -34,7 +34,7 @@ from probe2road.io.graph_writers import geojson_features
 from probe2road.raster.counts import rasterize
 from probe2road.raster.grid import Grid
 
-__all__ = ["write_view"]
+__all__ = ["view"]
 
 logger = logging.getLogger(__name__)
 
@@ -59,11 +59,11 @@ _SEQUENCE = ("#fdc328", "#f07f4f", "#cc4778", "#8305a7", "#2c0594")  # light to 
 _UNITS = {"length": "m"}
 
 
-def write_view(
+def view(
     graph: RoadGraph,
     path: str | PathLike[str],
     *,
-    traces: Fleet | None = None,
+    fleet: Fleet | None = None,
     title: str = "Road graph",
     color_by: str = "origin",
     resolution: float = 1.0,
@@ -76,7 +76,7 @@ def write_view(
         The graph; an empty one gives a page that shows the traces only.
     path
         The HTML file.
-    traces
+    fleet
         Fleet data for the density layers: traces, and semantic points where there are any. Only counts per
         pixel enter the page, never a trace.
     title
@@ -100,7 +100,7 @@ def write_view(
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> page = Path(tempfile.mkdtemp()) / "roads.html"
     >>> graph = graph_from_lines([[(446000, 4636000), (446100, 4636000)]], crs="EPSG:32616")
-    >>> write_view(graph, page, title="A & B")
+    >>> view(graph, page, title="A & B")
     >>> "<h1>A &amp; B</h1>" in page.read_text()
     True
     """
@@ -108,14 +108,14 @@ def write_view(
         raise OptionError(f"resolution is {resolution}", where="view", fix="use metres per pixel, for example 1.0")
     graph = outgoing(graph, where=path)
     data = {
-        "bounds": _bounds(graph, traces),
+        "bounds": _bounds(graph, fleet),
         "edges": {"type": "FeatureCollection", "features": geojson_features(_edge_table(graph), decimals=_DECIMALS)},
         "nodes": {"type": "FeatureCollection", "features": _node_features(graph)},
-        "densities": [] if traces is None or traces.traces.empty else _densities(traces, resolution),
+        "densities": [] if fleet is None or fleet.traces.empty else _densities(fleet, resolution),
         "attributes": _attributes(graph.edges, color_by),
         "columns": _columns(graph.edges),
     }
-    page = _page(title=title, summary=_summary(graph, traces), data=data)
+    page = _page(title=title, summary=_summary(graph, fleet), data=data)
     with atomic_path(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     logger.info("wrote a view of %d edges to %s (%.1f MB)", len(graph.edges), path, len(page) / 1e6)

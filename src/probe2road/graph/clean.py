@@ -56,7 +56,7 @@ class CleanOptions:
             _require_length(getattr(self, name), name)
 
 
-def clean_graph(graph: RoadGraph, options: CleanOptions | None = None) -> RoadGraph:
+def clean_graph(graph: RoadGraph, *, options: CleanOptions | None = None) -> RoadGraph:
     """Clean a graph until nothing changes any more.
 
     Each round drops small components and short dead ends, then collapses short edges between junctions, then

@@ -23,7 +23,7 @@ from probe2road.matching.frame import frame
 from probe2road.matching.match import MatchOptions, match
 from probe2road.matching.osrm import OsrmOptions, osrm_network, osrm_segments, osrm_server
 
-__all__ = ["MATCHERS", "LabelOptions", "cut_reference", "label_pieces", "label_reference"]
+__all__ = ["MATCHERS", "LabelOptions", "cut_reference", "label", "label_pieces"]
 
 logger = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ class LabelOptions:
                 raise OptionError(fault, where="LabelOptions", fix="use a positive number, and a share of at most 1")
 
 
-def label_reference(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions | None = None) -> RoadGraph:
+def label(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions | None = None) -> RoadGraph:
     """Keep the pieces of a reference that enough traces of a fleet drive.
 
     Parameters
@@ -95,7 +95,7 @@ def label_reference(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions
     >>> there = pd.DataFrame({"t": range(15), "x": np.arange(5.0, 155, 10), "y": 1.0})
     >>> drives = pd.concat([there.assign(trace_id=k) for k in range(4)])
     >>> fleet = fleet_from_tables(drives, crs="EPSG:32616", target_crs="EPSG:32616")
-    >>> label_reference(reference, fleet).edges[["reference_edge", "length", "support"]].values.tolist()
+    >>> label(reference, fleet).edges[["reference_edge", "length", "support"]].values.tolist()
     [[0, 80.0, 4], [0, 80.0, 4]]
     """
     options = options or LabelOptions()
@@ -118,7 +118,7 @@ def label_pieces(reference: RoadGraph, fleet: Fleet, options: LabelOptions) -> t
     Parameters
     ----------
     reference, fleet, options
-        As for `label_reference`; the minimum number of traces is not looked at.
+        As for `label`; the minimum number of traces is not looked at.
 
     Returns
     -------
@@ -130,11 +130,11 @@ def label_pieces(reference: RoadGraph, fleet: Fleet, options: LabelOptions) -> t
     Raises
     ------
     CRSError, MissingExtraError, InputError
-        As `label_reference`.
+        As `label`.
     """
     if not same_crs(fleet.crs, reference.crs):
         fault = f"the traces are in {fleet.crs.name}, the reference is in {reference.crs.name}"
-        raise CRSError(fault, where="label_reference", fix="reproject one of them, for example with graph.to_crs")
+        raise CRSError(fault, where="label", fix="reproject one of them, for example with graph.to_crs")
     pieces = cut_reference(reference, max_piece=options.max_piece)
     ask = _covered_by_osrm if options.matcher == "osrm" else _covered_by_own
     table = _joined(ask(pieces, fleet, options))
@@ -171,7 +171,7 @@ def cut_reference(reference: RoadGraph, *, max_piece: float = 100.0) -> RoadGrap
 
 def _covered_by_own(pieces: RoadGraph, fleet: Fleet, options: LabelOptions) -> pd.DataFrame:
     """List the stretches that traces cover, by our own matcher: ``trace``, ``edge`` (row), ``low``, ``high`` (m)."""
-    driven, _ = frame(pieces, fleet, match(fleet, pieces, options.match))
+    driven, _ = frame(pieces, fleet, match(pieces, fleet, options=options.match))
     return pd.DataFrame({"trace": driven.trace, "edge": driven.edge, "low": driven.low, "high": driven.high})
 
 

@@ -79,7 +79,7 @@ class Matches:
 
 
 def match(
-    fleet: Fleet, graph: RoadGraph, options: MatchOptions | None = None, *, edge_weights: pd.Series | None = None
+    graph: RoadGraph, fleet: Fleet, *, options: MatchOptions | None = None, edge_weights: pd.Series | None = None
 ) -> Matches:
     """Find the edge of every fix, and the path of every trace.
 
@@ -89,10 +89,10 @@ def match(
 
     Parameters
     ----------
-    fleet
-        Traces; headings, speeds, accuracies and altitudes are used where they are there.
     graph
         Road graph in the same CRS. Edges can be driven both ways unless `driving_direction` says otherwise.
+    fleet
+        Traces; headings, speeds, accuracies and altitudes are used where they are there.
     options
         The defaults where it is None.
     edge_weights
@@ -120,7 +120,7 @@ def match(
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 80)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(5), "x": [20.0, 60, 90, 101, 500], "y": [1.0, 0, 2, 40, 500]})
-    >>> found = match(fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616"), graph)
+    >>> found = match(graph, fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616"))
     >>> found.fixes["edge"].tolist()
     [0, 0, 0, 1, <NA>]
     >>> found.fixes["reason"].iloc[-1]
@@ -142,7 +142,7 @@ def match(
         found.append((traces, _match_profile(_with_traces(fleet, traces), states, weight, str(name), options)))
     paths = joined_paths(found, fleet.starts)
     radius = np.array([_radius(str(name), options) for name in profile])
-    matches = Matches(fix_table(fleet, graph, states, paths, radius), step_table(fleet, graph, states, paths))
+    matches = Matches(fix_table(graph, fleet, states, paths, radius), step_table(graph, fleet, states, paths))
     logger.info(
         "matched %d of %d fixes of %d traces to %d of %d edges",
         int(matches.fixes["edge"].notna().sum()), len(matches.fixes), fleet.n_traces,
@@ -177,7 +177,7 @@ def turn_counts(matches: Matches, graph: RoadGraph) -> pd.DataFrame:
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(4), "x": [130.0, 110, 90, 70], "y": 0.0})
-    >>> found = match(fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616"), graph)
+    >>> found = match(graph, fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616"))
     >>> turn_counts(found, graph).values.tolist()
     [[1, 1, 0, 1]]
     """

@@ -61,7 +61,7 @@ def joined_paths(found: list[tuple[NDArray[np.int64], Paths]], starts: NDArray[n
 
 
 def fix_table(
-    fleet: Fleet, graph: RoadGraph, states: States, paths: Paths, radius: NDArray[np.float64]
+    graph: RoadGraph, fleet: Fleet, states: States, paths: Paths, radius: NDArray[np.float64]
 ) -> pd.DataFrame:
     """Write one row for each fix; ``radius`` (m), shape (traces,), is what its trace was searched within."""
     matched = paths.step >= 0
@@ -95,7 +95,7 @@ def _reasons(fleet: Fleet, states: States, paths: Paths, radius: NDArray[np.floa
     return pd.Categorical.from_codes(code, [*names, "edges near, but none fits", "the graph has no edges"])
 
 
-def step_table(fleet: Fleet, graph: RoadGraph, states: States, paths: Paths) -> pd.DataFrame:
+def step_table(graph: RoadGraph, fleet: Fleet, states: States, paths: Paths) -> pd.DataFrame:
     """Write one row for each traversal of an edge."""
     n_steps = len(paths.state)
     starts = fleet.starts

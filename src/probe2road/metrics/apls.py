@@ -38,7 +38,7 @@ class AplsOptions:
         require_positive("AplsOptions", snap=self.snap, spacing=self.spacing, max_points=self.max_points)
 
 
-def apls(proposal: RoadGraph, reference: RoadGraph, options: AplsOptions | None = None) -> Score:
+def apls(proposal: RoadGraph, reference: RoadGraph, *, options: AplsOptions | None = None) -> Score:
     """Score the lengths of routes.
 
     Both graphs are normalised first, as for `geo`. An empty graph scores 0, and so does one without any route.

@@ -29,7 +29,7 @@ class BufferGeoOptions:
         require_positive("BufferGeoOptions", spacing=self.spacing, **{f"radius {r}": r for r in self.radii})
 
 
-def buffer_geo(proposal: RoadGraph, reference: RoadGraph, options: BufferGeoOptions | None = None) -> list[Score]:
+def buffer_geo(proposal: RoadGraph, reference: RoadGraph, *, options: BufferGeoOptions | None = None) -> list[Score]:
     """Score which share of each map's length lies within a distance of the other map.
 
     A segment that is drawn twice, in either direction, counts once; roads drawn twice side by side count twice and

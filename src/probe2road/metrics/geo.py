@@ -57,7 +57,7 @@ class GeoSamples:
 HE_BALAKRISHNAN_2022 = GeoOptions(spacing=0.25, radius=1.0, matching="global", max_angle=60.0)
 
 
-def geo(proposal: RoadGraph, reference: RoadGraph, options: GeoOptions | None = None) -> Score:
+def geo(proposal: RoadGraph, reference: RoadGraph, *, options: GeoOptions | None = None) -> Score:
     """Score where the proposal's roads lie.
 
     Both graphs are normalised first: the proposal goes to the reference's CRS, nodes of degree 2 are merged.

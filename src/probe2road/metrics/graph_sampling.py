@@ -41,7 +41,7 @@ class GraphSamplingOptions:
 
 
 def graph_sampling(
-    proposal: RoadGraph, reference: RoadGraph, options: GraphSamplingOptions | None = None
+    proposal: RoadGraph, reference: RoadGraph, *, options: GraphSamplingOptions | None = None
 ) -> list[Score]:
     """Score both maps' samples at several distances.
 

@@ -69,7 +69,7 @@ class Pairs:
     reference: NDArray[np.int64]
 
 
-def itopo(proposal: RoadGraph, reference: RoadGraph, options: ItopoOptions | None = None) -> Score:
+def itopo(proposal: RoadGraph, reference: RoadGraph, *, options: ItopoOptions | None = None) -> Score:
     """Score how the proposal's roads connect.
 
     Both graphs are normalised first, as for `geo`. A node without an edge of the other graph within the radius
@@ -117,7 +117,7 @@ def itopo(proposal: RoadGraph, reference: RoadGraph, options: ItopoOptions | Non
 
 def itopo_networks(proposal: Network, reference: Network, options: ItopoOptions) -> Score:
     """Score normalised networks, as `itopo`."""
-    around_proposal, around_reference = itopo_pairs(proposal, reference, options)
+    around_proposal, around_reference = itopo_pairs(proposal, reference, options=options)
     precision_pairs = [around_proposal] if options.strict else [around_proposal, around_reference]
     recall_pairs = [around_reference] if options.strict else [around_proposal, around_reference]
     proposed = np.concatenate([pairs.proposal for pairs in precision_pairs])

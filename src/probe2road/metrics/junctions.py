@@ -80,7 +80,7 @@ class _Arms:
     reach: NDArray[np.float64]  # m from the place to that spot
 
 
-def junctions(proposal: RoadGraph, reference: RoadGraph, options: JunctionOptions | None = None) -> Score:
+def junctions(proposal: RoadGraph, reference: RoadGraph, *, options: JunctionOptions | None = None) -> Score:
     """Score whether arms connect where roads of the reference meet or cross.
 
     Both graphs are normalised first, as for `geo`. Places are the nodes of the reference with three edges or more,
@@ -132,7 +132,7 @@ def junctions(proposal: RoadGraph, reference: RoadGraph, options: JunctionOption
 
 def junctions_networks(proposal: Network, reference: Network, options: JunctionOptions) -> Score:
     """Score normalised networks, as `junctions`."""
-    pairs = junction_pairs(proposal, reference, options)
+    pairs = junction_pairs(proposal, reference, options=options)
     both = int(np.count_nonzero(pairs.true & pairs.said))
     return Score.from_counts(
         "junctions",

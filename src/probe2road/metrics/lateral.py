@@ -32,7 +32,7 @@ class LateralOptions:
         require_positive("LateralOptions", **asdict(self))
 
 
-def lateral(proposal: RoadGraph, reference: RoadGraph, options: LateralOptions | None = None) -> Score:
+def lateral(proposal: RoadGraph, reference: RoadGraph, *, options: LateralOptions | None = None) -> Score:
     """Measure how far the proposal's roads lie beside those of the reference.
 
     Both graphs are normalised first, as for `geo`. Only samples with a road of about their direction within the
@@ -76,8 +76,8 @@ def lateral(proposal: RoadGraph, reference: RoadGraph, options: LateralOptions |
 
 def lateral_networks(proposal: Network, reference: Network, options: LateralOptions) -> Score:
     """Score normalised networks, as `lateral`."""
-    _, gap = lateral_gaps(proposal, reference, options)
-    _, back = lateral_gaps(reference, proposal, options)
+    _, gap = lateral_gaps(proposal, reference, options=options)
+    _, back = lateral_gaps(reference, proposal, options=options)
     error = gap[np.isfinite(gap)]
     median, p95 = np.quantile(error, [0.5, 0.95]) if len(error) else (None, None)
     rms = np.sqrt((error**2).mean()) if len(error) else None
@@ -97,7 +97,7 @@ def lateral_networks(proposal: Network, reference: Network, options: LateralOpti
 
 
 def lateral_gaps(
-    network: Network, other: Network, options: LateralOptions
+    network: Network, other: Network, *, options: LateralOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Sample a network and measure each sample's distance to the other network's road beside it.
 

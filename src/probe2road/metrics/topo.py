@@ -45,7 +45,7 @@ class TopoOptions:
         require_positive("TopoOptions", **positive)
 
 
-def topo(proposal: RoadGraph, reference: RoadGraph, options: TopoOptions | None = None) -> Score:
+def topo(proposal: RoadGraph, reference: RoadGraph, *, options: TopoOptions | None = None) -> Score:
     """Score what can be reached from the same places.
 
     Both graphs are normalised first, as for `geo`. An empty graph scores 0.

@@ -110,7 +110,7 @@ def add_evidence(
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 80)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(4), "x": [80.0, 60, 40, 20], "y": 0.0, "z": 7.0})
     >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
-    >>> known = add_evidence(graph, fleet, match(fleet, graph))
+    >>> known = add_evidence(graph, fleet, match(graph, fleet))
     >>> known.edges[["support", "forward", "backward", "speed"]].values.tolist()
     [[1, 0, 1, 20.0], [0, 0, 0, nan]]
     >>> print(known.edges.geometry[0])

@@ -26,7 +26,7 @@ from probe2road.refinement.undriven import RungOptions, drop_undriven
 from probe2road.run.progress import Progress, silent
 from probe2road.run.workspace import Workspace
 
-__all__ = ["RefineOptions", "refine_graph"]
+__all__ = ["RefineOptions", "refine"]
 
 _SPLITS = 2  # how often junctions are split
 
@@ -67,14 +67,14 @@ class RefineOptions:
         )
 
 
-def refine_graph(
+def refine(
     graph: RoadGraph,
     fleet: Fleet,
-    options: RefineOptions | None = None,
     *,
+    options: RefineOptions | None = None,
     clean: CleanOptions | None = None,
-    work: Workspace | None = None,
-    report: Progress | None = None,
+    workspace: Workspace | None = None,
+    progress: Progress | None = None,
 ) -> RoadGraph:
     """Fill gaps, split false junctions, move forks and count drives, all by matching traces to the graph.
 
@@ -88,9 +88,9 @@ def refine_graph(
         The defaults where it is None; what is None in them is settled as for the density segmenter.
     clean
         How the graph is cleaned once its gaps are filled.
-    work
+    workspace
         Where the graph of every step is kept.
-    report
+    progress
         Called as the work goes on.
 
     Returns
@@ -107,8 +107,8 @@ def refine_graph(
     -----
     Paper, section III-B; METHOD 0.1 rows 16 to 27, in the order of row 27.
     """
-    options, work = (options or RefineOptions()).for_segmenter(learned=False), work or Workspace(None)
-    report = report or silent
+    options, work = (options or RefineOptions()).for_segmenter(learned=False), workspace or Workspace(None)
+    report = progress or silent
     if graph.edges.empty:
         return graph
     report("matching", 0, 6)
@@ -117,31 +117,31 @@ def refine_graph(
     jumped = fill_jumps(filled, matches.steps, options=options.gaps)
     if jumped is not filled:
         filled, matches = jumped, _matched(fleet, jumped, options)
-    graph = clean_graph(prune_gaps(filled, matches.steps, min_traces=options.min_traces), clean)
+    graph = clean_graph(prune_gaps(filled, matches.steps, min_traces=options.min_traces), options=clean)
     work.write_graph("6-gaps-filled", graph)
 
     # What is split and dropped the first time may have hidden further false junctions.
-    matches = match(fleet, graph, options.matching)
+    matches = match(graph, fleet, options=options.matching)
     for turn in range(_SPLITS):
         report("matching", 1 + 2 * turn, 6)
-        positions = passing_positions(fleet, matches, graph)
+        positions = passing_positions(graph, fleet, matches)
         split = split_false_junctions(graph, matches.steps, positions=positions, options=options.junctions)
         if turn and (len(split.nodes), len(split.edges)) == (len(graph.nodes), len(graph.edges)):
             break
-        graph, matches = split, match(fleet, split, options.matching)
+        graph, matches = split, match(split, fleet, options=options.matching)
         report("matching", 2 + 2 * turn, 6)
         rungs = options.rungs if options.min_support else None
         driven = drop_undriven(graph, matches.steps, min_traces=options.min_support or 0, rungs=rungs)
         if driven is not graph:
-            graph = clean_graph(driven, clean)
-            matches = match(fleet, graph, options.matching)
+            graph = clean_graph(driven, options=clean)
+            matches = match(graph, fleet, options=options.matching)
     report("matching", 5, 6)
     opened = open_braids(graph, matches.steps, options=options.braids)
     if opened is not graph:
-        graph, matches = opened, match(fleet, opened, options.matching)
+        graph, matches = opened, match(opened, fleet, options=options.matching)
     moved = move_forks(graph, fleet, matches, options=options.forks)
     if moved is not graph:
-        graph, matches = moved, match(fleet, moved, options.matching)
+        graph, matches = moved, match(moved, fleet, options=options.matching)
     graph = add_evidence(graph, fleet, matches, options=options.evidence)
     if options.move:
         graph = refine_centreline(graph, fleet, matches, options=options.centreline)
@@ -151,4 +151,4 @@ def refine_graph(
 
 def _matched(fleet: Fleet, graph: RoadGraph, options: RefineOptions) -> Matches:
     """Match to a graph with proposed links."""
-    return match(fleet, graph, options.matching, edge_weights=gap_weights(graph, gap=options.gap_weight))
+    return match(graph, fleet, options=options.matching, edge_weights=gap_weights(graph, gap=options.gap_weight))

@@ -68,7 +68,7 @@ class DensityOptions:
 
 
 def density_segmenter(
-    fleet: Fleet, grid: Grid, options: DensityOptions | None = None, *, gaps: TraceGaps | None = None
+    fleet: Fleet, grid: Grid, *, options: DensityOptions | None = None, gaps: TraceGaps | None = None
 ) -> Segmenter:
     """Return the density segmenter for a fleet, its bandwidth settled.
 
@@ -95,7 +95,7 @@ def density_segmenter(
     assert settled.bandwidth is not None
 
     def predict(counts: NDArray[np.uint32], window: Grid) -> NDArray[np.float32]:
-        return density_probability(counts[0], window, settled)
+        return density_probability(counts[0], window, options=settled)
 
     return Segmenter(
         name="density",
@@ -109,7 +109,9 @@ def density_segmenter(
     )
 
 
-def density_probability(trace_counts: NDArray[np.uint32], grid: Grid, options: DensityOptions) -> NDArray[np.float32]:
+def density_probability(
+    trace_counts: NDArray[np.uint32], grid: Grid, *, options: DensityOptions
+) -> NDArray[np.float32]:
     """Return the probability that pixels lie on a centreline, from the trace channel.
 
     Parameters
@@ -138,7 +140,7 @@ def density_probability(trace_counts: NDArray[np.uint32], grid: Grid, options: D
     >>> counts = np.zeros((41, 41), np.uint32)
     >>> counts[20] = 5
     >>> grid = Grid.from_bounds((1000, 0, 1040.5, 40.5), crs="EPSG:32616")
-    >>> probability = density_probability(counts, grid, DensityOptions(bandwidth=3.0))
+    >>> probability = density_probability(counts, grid, options=DensityOptions(bandwidth=3.0))
     >>> probability[[20, 10], 20].tolist()
     [0.72..., 0.0]
     """

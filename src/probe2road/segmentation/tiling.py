@@ -64,7 +64,7 @@ def segment_raster(segmenter: Segmenter, counts: NDArray[Any], grid: Grid) -> ND
     >>> from probe2road.raster.counts import fleet_grid, rasterize
     >>> fleet = demo_fleet(n_drives=5)
     >>> grid = fleet_grid(fleet)
-    >>> segmenter = density_segmenter(fleet, grid, DensityOptions(bandwidth=4.0))
+    >>> segmenter = density_segmenter(fleet, grid, options=DensityOptions(bandwidth=4.0))
     >>> bool((segment_raster(segmenter, rasterize(fleet, grid), grid) > 0.5).any())
     True
     """

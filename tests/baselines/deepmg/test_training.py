@@ -126,13 +126,13 @@ def test_prediction_answers_for_driven_windows_and_each_cell_once(drives: Fleet,
 def test_the_whole_method_gives_a_valid_graph(drives: Fleet, tiles: TileSet, tmp_path: Path) -> None:
     weights = train(tiles, tiles, tmp_path / "run", QUICK)
     options = DeepMGOptions(weights=str(weights), threshold=0.6)
-    graph = build_deepmg(drives, options, workspace=tmp_path / "work")
+    graph = build_deepmg(drives, options=options, workspace=tmp_path / "work")
     check_graph(graph)
     assert (tmp_path / "work" / "1-probability.tif").exists()
-    again = build_deepmg(drives, options, workspace=tmp_path / "work")
+    again = build_deepmg(drives, options=options, workspace=tmp_path / "work")
     assert again.edges["length"].tolist() == pytest.approx(graph.edges["length"].tolist())
     with pytest.raises(OptionError, match="weights are of the variant fixed"):
-        build_deepmg(drives, DeepMGOptions(weights=str(weights), variant="as_published"))
+        build_deepmg(drives, options=DeepMGOptions(weights=str(weights), variant="as_published"))
 
 
 def test_missing_and_foreign_weights_are_refused(drives: Fleet, tmp_path: Path) -> None:
@@ -140,4 +140,4 @@ def test_missing_and_foreign_weights_are_refused(drives: Fleet, tmp_path: Path) 
         build_deepmg(drives)
     (tmp_path / "w.pt").write_text("not a network")
     with pytest.raises(InputError, match="not weights of T2RNet"):
-        build_deepmg(drives, DeepMGOptions(weights=str(tmp_path / "w.pt")))
+        build_deepmg(drives, options=DeepMGOptions(weights=str(tmp_path / "w.pt")))

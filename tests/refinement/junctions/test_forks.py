@@ -41,7 +41,7 @@ def drives(
 
 
 def moved(graph: RoadGraph, fleet: Fleet, **options: float) -> RoadGraph:
-    result = move_forks(graph, fleet, match(fleet, graph), options=ForkOptions(**options))
+    result = move_forks(graph, fleet, match(graph, fleet), options=ForkOptions(**options))
     check_graph(result)
     return result
 

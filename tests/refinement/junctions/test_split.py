@@ -271,24 +271,24 @@ class TestPositions:
         east = pd.DataFrame({"trace_id": "a", "t": range(9), "x": x, "y": 0.0, "z": 10 + x / 10})
         for table, expected in ((east, [0.0, 0.0, 10.0]), (east.drop(columns="t"), [np.nan] * 3)):
             fleet = fleet_from_tables(table, crs=UTM, target_crs=UTM)
-            found = passing_positions(fleet, match(fleet, CROSS), CROSS)
+            found = passing_positions(CROSS, fleet, match(fleet, CROSS))
             assert found["via_node"].tolist() == [1]
             assert found[["x", "y", "z"]].to_numpy()[0] == pytest.approx(expected, abs=1e-6, nan_ok=True)
 
     def test_far_fixes_say_nothing(self) -> None:
         table = pd.DataFrame({"trace_id": 1, "t": [0, 4], "x": [-80.0, 80.0], "y": 0.0, "z": 5.0})
         fleet = fleet_from_tables(table, crs=UTM, target_crs=UTM)
-        assert passing_positions(fleet, match(fleet, CROSS), CROSS)["z"].isna().all()
+        assert passing_positions(CROSS, fleet, match(fleet, CROSS))["z"].isna().all()
 
     def test_other_graph(self) -> None:
         fleet = fleet_from_tables(
             pd.DataFrame({"trace_id": 1, "t": range(9), "x": np.arange(-80.0, 81.0, 20), "y": 0.0}),
             crs=UTM, target_crs=UTM,
         )  # fmt: skip
-        matches = match(fleet, CROSS)
+        matches = match(CROSS, fleet)
         other = graph_of([(0, 0), (90, 0)])
         with pytest.raises(InputError, match="nodes that are not in the graph"):
-            passing_positions(fleet, matches, replace(other, nodes=other.nodes.iloc[:1]))
+            passing_positions(replace(other, nodes=other.nodes.iloc[:1]), fleet, matches)
         with pytest.raises(
             InputError, match=r"edge 1 of the steps is not in the graph; pass the graph that was matched"
         ):

@@ -71,8 +71,8 @@ FLEET = BiagioniOptions(closing=0.0, simplify_tolerance=2.0, last_runs=True)
 
 def build_biagioni(
     fleet: Fleet,
-    options: BiagioniOptions | None = None,
     *,
+    options: BiagioniOptions | None = None,
     workspace: str | Path | None = None,
     progress: Progress | None = None,
 ) -> RoadGraph:

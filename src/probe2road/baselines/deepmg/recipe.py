@@ -61,8 +61,8 @@ class _Run:
 
 def build_deepmg(
     fleet: Fleet,
-    options: DeepMGOptions | None = None,
     *,
+    options: DeepMGOptions | None = None,
     workspace: str | Path | None = None,
     progress: Progress | None = None,
 ) -> RoadGraph:

@@ -43,7 +43,7 @@ def geo_counts(proposal: Network, reference: Network, options: GeoOptions | None
     >>> geo_counts(*comparable_networks(*graphs))[["proposal", "reference"]].to_dict("index")
     {'0_0': {'proposal': 10, 'reference': 10}, '1_0': {'proposal': 1, 'reference': 11}}
     """
-    samples = geo_samples(proposal, reference, options or GeoOptions())
+    samples = geo_samples(proposal, reference, options=options or GeoOptions())
     one, other = samples.proposal_matched, samples.reference_matched
     return pd.concat(
         [
@@ -55,7 +55,7 @@ def geo_counts(proposal: Network, reference: Network, options: GeoOptions | None
 
 def itopo_counts(proposal: Network, reference: Network, options: ItopoOptions | None = None) -> pd.DataFrame:
     """Count the samples of iTOPO in each tile; a pair lies where its node does. See `geo_counts`."""
-    pairs = itopo_pairs(proposal, reference, options or ItopoOptions())
+    pairs = itopo_pairs(proposal, reference, options=options or ItopoOptions())
     tables = [
         _tiles(
             network.node_xy[side.node],

@@ -95,7 +95,7 @@ def places_around(graph: RoadGraph, inner: NDArray[np.int64]) -> Places:
     return Places(near["edge"].to_numpy(np.int64) + len(graph.nodes), near["end"].to_numpy(np.int64))
 
 
-def passing_positions(fleet: Fleet, matches: Matches, graph: RoadGraph) -> pd.DataFrame:
+def passing_positions(graph: RoadGraph, fleet: Fleet, matches: Matches) -> pd.DataFrame:
     """Return where every trace was when it passed a node.
 
     Positions are those of the traces themselves, interpolated between the fixes around the node. One trace is
@@ -104,12 +104,12 @@ def passing_positions(fleet: Fleet, matches: Matches, graph: RoadGraph) -> pd.Da
 
     Parameters
     ----------
+    graph
+        The graph.
     fleet
         The fleet that was matched.
     matches
         Its matches on ``graph``.
-    graph
-        The graph.
 
     Returns
     -------
@@ -130,7 +130,7 @@ def passing_positions(fleet: Fleet, matches: Matches, graph: RoadGraph) -> pd.Da
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(4), "x": [70.0, 90, 110, 130], "y": 0.0, "z": [4.0, 5, 7, 8]})
     >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
-    >>> passing_positions(fleet, match(fleet, graph), graph).values.tolist()
+    >>> passing_positions(graph, fleet, match(graph, fleet)).values.tolist()
     [[1.0, 1.0, 1.0, 100.0, 0.0, 6.0]]
     """
     steps = matches.steps
