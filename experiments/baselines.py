@@ -26,6 +26,7 @@ from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.metrics.evaluate import MetricOptions
 from probe2road.recipe import BuildOptions
+from probe2road.segmentation.options import SegmentationOptions
 
 PUBLISHED = "Biagioni 2012"
 METRICS: list[str | MetricOptions] = ["geo", "itopo", "topo", "apls"]
@@ -58,7 +59,7 @@ def probe2road(fleet: Fleet) -> RoadGraph:
 
 def probe2road_density(fleet: Fleet) -> RoadGraph:
     """With the density segmenter."""
-    return build(fleet, options=BuildOptions(segmenter="density"))
+    return build(fleet, options=BuildOptions(segmentation=SegmentationOptions(segmenter="density")))
 
 
 METHODS: dict[str, Callable[[Fleet], RoadGraph]] = {

@@ -28,6 +28,7 @@ from probe2road.matching.match import match
 from probe2road.recipe import BuildOptions
 from probe2road.refinement.centreline import CentrelineOptions, refine_centreline
 from probe2road.refinement.recipe import RefineOptions
+from probe2road.segmentation.options import SegmentationOptions
 from probe2road.simulation.drawn.generate import generate_interchange, generate_town
 from probe2road.simulation.fleet_simulation import simulate
 from probe2road.simulation.networks.network import RoadNetwork
@@ -35,7 +36,7 @@ from probe2road.simulation.networks.osm import read_network
 
 CASES = ("cloverleaf", "diamond", "trumpet", "regular town", "irregular town", "tokyo_shibuya")
 PRESETS = ("mixed", "phone")
-UNMOVED = BuildOptions(segmenter="density", refinement=RefineOptions(move=False))
+UNMOVED = BuildOptions(segmentation=SegmentationOptions(segmenter="density"), refinement=RefineOptions(move=False))
 
 _STEP = 5.0  # m between the places at which the error is measured
 _FAR = 15.0  # m; what is farther from every true road running that way is a wrong road, not a wrong place

@@ -33,6 +33,7 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_writer import points_path
 from probe2road.metrics.normalise import clip_graph
 from probe2road.recipe import BuildOptions
+from probe2road.segmentation.options import SegmentationOptions
 
 METRICS = ("geo", "itopo", "topo")
 NAMES = {"geo": "GEO", "itopo": "iTOPO", "topo": "TOPO"}
@@ -103,7 +104,7 @@ def report(name: str, recording: Recording, pictures: Path | None) -> None:
 def timed_build(name: str, source: str, fleet: Fleet) -> Built:
     """Build with the defaults, but without the stages that match traces to the graph."""
     started = time.perf_counter()
-    graph = build(fleet, options=BuildOptions(segmenter="density", refine=False))
+    graph = build(fleet, options=BuildOptions(segmentation=SegmentationOptions(segmenter="density"), refine=False))
     return Built(name, source, graph, time.perf_counter() - started)
 
 

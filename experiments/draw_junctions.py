@@ -22,6 +22,7 @@ from probe2road.recipe import BuildOptions, build
 from probe2road.refinement.gaps.fill import fill_gaps, gap_weights, prune_gaps
 from probe2road.refinement.junctions.passages import passing_positions
 from probe2road.refinement.junctions.split import split_false_junctions
+from probe2road.segmentation.options import SegmentationOptions
 from probe2road.simulation.drawn.generate import generate_interchange
 from probe2road.simulation.fleet_simulation import SimulatedFleet, simulate
 from probe2road.simulation.presets import find_preset
@@ -39,7 +40,7 @@ ROAD, EDGE, GAP, NODE, DEAD_END = "#d9dde3", "#27496d", "#d1495b", "#111111", "#
 def stages(simulated: SimulatedFleet) -> list[RoadGraph]:
     """Build a graph and return it after each step."""
     fleet = simulated.fleet
-    graph = build(fleet, options=BuildOptions(segmenter="density", refine=False))
+    graph = build(fleet, options=BuildOptions(segmentation=SegmentationOptions(segmenter="density"), refine=False))
     filled = fill_gaps(graph)
     pruned = clean_graph(prune_gaps(filled, match(filled, fleet, edge_weights=gap_weights(filled)).steps))
     matches = match(pruned, fleet)

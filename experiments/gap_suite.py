@@ -20,6 +20,7 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.match import match
 from probe2road.recipe import BuildOptions, build
 from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, gap_weights, prune_gaps
+from probe2road.segmentation.options import SegmentationOptions
 from probe2road.simulation.drawn.generate import INTERCHANGES, generate_interchange
 from probe2road.simulation.fleet_simulation import simulate
 from probe2road.simulation.presets import find_preset
@@ -69,7 +70,9 @@ def measure(kind: str, preset: str, drives: int) -> list[dict[str, object]]:
     network = generate_interchange(kind, rng=np.random.default_rng(1))
     simulated = simulate(network, preset=replace(find_preset(preset), camera=None), n_drives=drives, seed=1)
     reference, distances = simulated.reference, road_distances(simulated.reference)
-    graph = build(simulated.fleet, options=BuildOptions(segmenter="density", refine=False))
+    graph = build(
+        simulated.fleet, options=BuildOptions(segmentation=SegmentationOptions(segmenter="density"), refine=False)
+    )
     border = shapely.union_all(reference.nodes.geometry[reference.degrees() == 1].to_numpy())
     ends = graph.nodes[graph.degrees() == 1]
     inner = ends.index[ends.geometry.distance(border).fillna(np.inf) > _BORDER]

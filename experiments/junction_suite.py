@@ -31,6 +31,7 @@ from probe2road.recipe import BuildOptions, build
 from probe2road.refinement.gaps.fill import fill_gaps, gap_weights, prune_gaps
 from probe2road.refinement.junctions.passages import passing_positions
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
+from probe2road.segmentation.options import SegmentationOptions
 from probe2road.simulation.drawn.generate import generate_interchange, generate_town
 from probe2road.simulation.driving.routes import LinkGraph, draw_route
 from probe2road.simulation.fleet_simulation import FleetWorld, fleet_world, simulate_drive
@@ -251,7 +252,7 @@ def score_builds(name: str, preset: str, counts: Iterable[int], *, seed: int) ->
     for k in counts:
         chosen = fleet.traces["trace_id"].map(repetition) < k
         some = replace(fleet, traces=fleet.traces[chosen].reset_index(drop=True))
-        built = build(some, options=BuildOptions(segmenter="density", refine=False))
+        built = build(some, options=BuildOptions(segmentation=SegmentationOptions(segmenter="density"), refine=False))
         filled = fill_gaps(built)
         joined = clean_graph(prune_gaps(filled, match(filled, some, edge_weights=gap_weights(filled)).steps))
         matches = match(joined, some)

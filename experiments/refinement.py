@@ -35,6 +35,7 @@ from probe2road.refinement.junctions.forks import move_forks
 from probe2road.refinement.junctions.passages import passing_positions
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
 from probe2road.refinement.undriven import RungOptions, drop_undriven
+from probe2road.segmentation.options import SegmentationOptions
 
 CITIES = ("boston", "hannover", "tokyo_shibuya")
 # Latitude and longitude of the densest interchanges.
@@ -98,7 +99,7 @@ def rows(fleet: Fleet, segmenter: str, built: RoadGraph | None) -> list[Row]:
         started = time.perf_counter()
 
     if built is None:
-        built = build(fleet, options=BuildOptions(segmenter=segmenter, refine=False))
+        built = build(fleet, options=BuildOptions(segmentation=SegmentationOptions(segmenter=segmenter), refine=False))
     note("no post-processing", built)
     filled = fill_gaps(built)
     matches = match(filled, fleet, edge_weights=gap_weights(filled))

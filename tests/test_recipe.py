@@ -16,10 +16,13 @@ from probe2road.raster.grid import read_raster
 from probe2road.recipe import BuildOptions, build
 from probe2road.run.workspace import fingerprint
 from probe2road.segmentation.density import DensityOptions, density_probability
+from probe2road.segmentation.options import SegmentationOptions
 
 CRS = "EPSG:32616"
 ORIGIN = np.array([446000.0, 4636000.0])
-DENSITY = BuildOptions(segmenter="density")  # no weights: quick, and everything is decided by the data
+DENSITY = BuildOptions(
+    segmentation=SegmentationOptions(segmenter="density")
+)  # no weights: quick, and everything is decided by the data
 CROSS = [[(0, 400), (400, 400)], [(400, 400), (800, 400)], [(400, 0), (400, 400)], [(400, 400), (400, 800)]]
 
 
@@ -44,7 +47,7 @@ def crossing():
 
 
 def test_a_crossing_comes_out(crossing):
-    graph = build(crossing, options=BuildOptions(segmenter="density", refine=False))
+    graph = build(crossing, options=replace(DENSITY, refine=False))
     check_graph(graph)
     assert sorted(graph.degrees()) == [1, 1, 1, 1, 4]
     reference = graph_from_lines([np.array(line) + ORIGIN for line in CROSS], crs=CRS)
@@ -81,7 +84,7 @@ def test_every_stage_is_kept_on_request(crossing, tmp_path):
 
 
 def test_an_interrupted_run_goes_on_where_it_stopped(crossing, tmp_path, monkeypatch):
-    options = BuildOptions(segmenter="density", density=DensityOptions(bandwidth=4.5))
+    options = BuildOptions(segmentation=SegmentationOptions(segmenter="density", density=DensityOptions(bandwidth=4.5)))
     whole = build(crossing, options=options)
     monkeypatch.setattr("probe2road.segmentation.density._WINDOW", 256)
     windows = []
@@ -96,11 +99,11 @@ def test_an_interrupted_run_goes_on_where_it_stopped(crossing, tmp_path, monkeyp
     monkeypatch.setattr("probe2road.segmentation.density.density_probability", counting)
     with pytest.raises(KeyboardInterrupt):
         build(crossing, options=options, workspace=tmp_path / "work")
-    assert len(list((tmp_path / "work").glob("window-*.npz"))) == 3
+    assert len(list((tmp_path / "work").glob("1-window-*.npz"))) == 3
     graph = build(crossing, options=options, workspace=tmp_path / "work")
     windows.remove("stop")
     assert len(windows) == len(set(windows)) > 3  # none was done twice
-    assert not list((tmp_path / "work").glob("window-*.npz"))
+    assert not list((tmp_path / "work").glob("1-window-*.npz"))
     assert graph.edges.geometry.geom_equals_exact(whole.edges.geometry, 1e-6).all()
 
 
@@ -120,10 +123,22 @@ def test_the_bandwidth_is_estimated_once_for_all_parts_of_a_run(crossing, tmp_pa
     monkeypatch.setattr("probe2road.segmentation.density.estimate_bandwidth", estimating)
     monkeypatch.setattr("probe2road.segmentation.density.density_probability", failing_at_first)
     with pytest.raises(KeyboardInterrupt):
-        build(crossing, options=BuildOptions(segmenter="density", refine=False), workspace=tmp_path / "work")
-    build(crossing, options=BuildOptions(segmenter="density", refine=False), workspace=tmp_path / "work")
+        build(
+            crossing,
+            options=replace(DENSITY, refine=False),
+            workspace=tmp_path / "work",
+        )
+    build(
+        crossing,
+        options=replace(DENSITY, refine=False),
+        workspace=tmp_path / "work",
+    )
     (tmp_path / "work" / "7-roads.gpkg").unlink()
-    build(crossing, options=BuildOptions(segmenter="density", refine=False), workspace=tmp_path / "work")
+    build(
+        crossing,
+        options=replace(DENSITY, refine=False),
+        workspace=tmp_path / "work",
+    )
     assert estimates == [5.0]
     assert set(predictions) == {5.0}
 
@@ -133,17 +148,24 @@ def test_a_workspace_of_another_run_is_not_mixed_in(crossing, tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         other = build(
             crossing,
-            options=BuildOptions(segmenter="density", density=DensityOptions(bandwidth=9.0)),
+            options=BuildOptions(
+                segmentation=SegmentationOptions(segmenter="density", density=DensityOptions(bandwidth=9.0))
+            ),
             workspace=tmp_path / "work",
         )
     assert "starting afresh" in caplog.text
-    again = build(crossing, options=BuildOptions(segmenter="density", density=DensityOptions(bandwidth=9.0)))
+    again = build(
+        crossing,
+        options=BuildOptions(
+            segmentation=SegmentationOptions(segmenter="density", density=DensityOptions(bandwidth=9.0))
+        ),
+    )
     assert other.edges.geometry.geom_equals_exact(again.edges.geometry, 1e-6).all()
 
 
 def test_options_behind_the_segmentation_keep_its_probability(crossing, tmp_path, monkeypatch):
     build(crossing, options=DENSITY, workspace=tmp_path / "work")
-    monkeypatch.setattr("probe2road.recipe.predict_window", None)  # nothing is predicted again
+    monkeypatch.setattr("probe2road.segmentation.probability.predict_window", None)  # nothing is predicted again
     other = replace(DENSITY, thinning="zhang_suen", clean=CleanOptions(dead_end=40.0))
     graph = build(crossing, options=other, workspace=tmp_path / "work")
     monkeypatch.undo()
@@ -166,11 +188,14 @@ def test_a_folder_with_other_things_in_it_is_left_alone(crossing, tmp_path):
 def test_progress_is_reported_to_the_end(crossing):
     told = []
     build(crossing, options=DENSITY, progress=lambda *args: told.append(args))
-    assert [stage for stage, done, total in told if done == total] == ["segmentation", "graph", "matching"]
+    assert [stage for stage, done, total in told if done == total] == ["segmentation", "graph", "refinement"]
 
 
 def test_a_finer_grid_gives_the_same_roads(crossing):
-    coarse, fine = (build(crossing, options=BuildOptions(segmenter="density", resolution=r)) for r in (1.0, 0.5))
+    coarse, fine = (
+        build(crossing, options=BuildOptions(segmentation=SegmentationOptions(segmenter="density", resolution=r)))
+        for r in (1.0, 0.5)
+    )
     assert evaluate(fine, coarse, metrics=["geo"])["f1"].iloc[0] > 0.9
 
 
@@ -188,7 +213,7 @@ def test_no_fixes_are_an_error(crossing):
 
 def test_an_unknown_segmenter_is_an_error():
     with pytest.raises(OptionError, match="density"):
-        BuildOptions(segmenter="magic")
+        BuildOptions(segmentation=SegmentationOptions(segmenter="magic"))
 
 
 def test_the_fingerprint_sees_every_change(crossing):

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from probe2road.raster.counts import rasterize
     from probe2road.recipe import BuildOptions, build
     from probe2road.refinement.recipe import refine
+    from probe2road.segmentation.options import SegmentationOptions
 
 _HOME = {
     "Probe2RoadError": "errors",
@@ -50,6 +51,7 @@ _HOME = {
     "refine": "refinement.recipe",
     "label": "matching.labels",
     "BuildOptions": "recipe",
+    "SegmentationOptions": "segmentation.options",
     "build": "recipe",
     "evaluate": "metrics.evaluate",
     "view": "draw.page",
@@ -62,6 +64,7 @@ __all__ = [
     "Matches",
     "Probe2RoadError",
     "RoadGraph",
+    "SegmentationOptions",
     "TraceGaps",
     "__version__",
     "build",

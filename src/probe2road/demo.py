@@ -16,7 +16,8 @@ from probe2road.io.fleet_reader import read_fleet_files
 from probe2road.io.fleet_writer import write_fleet
 from probe2road.io.graph_files import write_graph
 from probe2road.metrics import evaluate
-from probe2road.recipe import Progress, build
+from probe2road.recipe import build
+from probe2road.run.progress import Progress
 from probe2road.simulation.drawn.generate import generate_interchange
 from probe2road.simulation.fleet_simulation import SimulatedFleet, simulate
 

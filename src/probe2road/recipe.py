@@ -2,48 +2,36 @@
 
 from __future__ import annotations
 
-import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
-import numpy as np
-from numpy.typing import NDArray
-
 from probe2road.errors import OptionError
-from probe2road.fleet.contract import Fleet, TraceGaps
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.raster.counts import fleet_grid, rasterize_windows
-from probe2road.raster.grid import Grid, sparse_zeros
+from probe2road.raster.counts import fleet_grid
 from probe2road.refinement.recipe import RefineOptions, refine
 from probe2road.run.progress import Progress, silent
+from probe2road.run.stages import CLEANED, MASK, ROADS, SKELETON, VECTORIZED
 from probe2road.run.workspace import Workspace, open_workspace
-from probe2road.segmentation.density import DensityOptions, density_segmenter
-from probe2road.segmentation.mask import threshold_mask
-from probe2road.segmentation.network import NetworkOptions, find_weights, network_segmenter
-from probe2road.segmentation.segmenter import Segmenter
-from probe2road.segmentation.tiling import add_window, predict_window
+from probe2road.segmentation.mask import MaskOptions, threshold_mask
+from probe2road.segmentation.network import find_weights
+from probe2road.segmentation.options import SegmentationOptions
+from probe2road.segmentation.probability import centreline_probability, find_segmenter
 from probe2road.segmentation.weights import Weights
 from probe2road.vectorize.lines import VectorizeOptions, vectorize
 from probe2road.vectorize.skeleton import METHODS, Method, skeletonize_windows
 
-__all__ = ["SEGMENTERS", "BuildOptions", "Progress", "Segmentation", "build"]
-
-logger = logging.getLogger(__name__)
-
-SEGMENTERS = ("network", "density")
+__all__ = ["BuildOptions", "build"]
 
 
 @dataclass(frozen=True)
 class BuildOptions:
     """Everything that decides which graph comes out."""
 
-    resolution: float = 1.0  # m per pixel
-    segmenter: str = "network"  # one of SEGMENTERS
-    gaps: TraceGaps = field(default_factory=TraceGaps)  # where traces are broken
-    network: NetworkOptions = field(default_factory=NetworkOptions)  # of the learned segmenter
-    density: DensityOptions = field(default_factory=DensityOptions)  # of the density segmenter
+    segmentation: SegmentationOptions = field(default_factory=SegmentationOptions)  # what decides the probability
+    mask: MaskOptions = field(default_factory=MaskOptions)  # which probability makes a road
     thinning: str = "guo_hall"  # how the mask becomes lines of one pixel; or zhang_suen
     vectorize: VectorizeOptions = field(default_factory=VectorizeOptions)  # how pixels become lines
     clean: CleanOptions = field(default_factory=CleanOptions)  # what counts as a flaw
@@ -51,28 +39,9 @@ class BuildOptions:
     refinement: RefineOptions = field(default_factory=RefineOptions)  # how they do
 
     def __post_init__(self) -> None:
-        """Refuse an unknown segmenter."""
-        if self.segmenter not in SEGMENTERS:
-            raise OptionError(f"there is no segmenter {self.segmenter!r}", fix=f"use {', '.join(SEGMENTERS)}")
+        """Refuse an unknown thinning."""
         if self.thinning not in METHODS:
             raise OptionError(f"there is no thinning {self.thinning!r}", fix=f"use {' or '.join(METHODS)}")
-
-
-@dataclass(frozen=True)
-class Segmentation:
-    """What the probability depends on, out of the build options."""
-
-    resolution: float
-    segmenter: str
-    gaps: TraceGaps
-    network: NetworkOptions
-    density: DensityOptions
-
-    @classmethod
-    def of(cls, options: BuildOptions) -> Segmentation:
-        """Take what counts; the thresholds of the network come after the probability."""
-        network = replace(options.network, threshold=None, seed_threshold=None)
-        return cls(options.resolution, options.segmenter, options.gaps, network, options.density)
 
 
 def build(
@@ -99,6 +68,7 @@ def build(
         Folder for what every stage makes (GeoTIFF and GeoPackage). A run on the same fleet with the same
         options takes from it what an earlier run completed, down to single windows; one with other options behind
         the segmentation takes the probability. Nothing is written where it is None.
+        `probe2road.run.workspace.resumable` gives one that goes when the work is done.
     progress
         Called as the work goes on.
 
@@ -113,6 +83,8 @@ def build(
         If the fleet has no fixes, or the weights of the network are bad or look at what it does not have.
     OptionError
         If an option makes no sense.
+    OutputError
+        If the workspace cannot be written, is no workspace, or is held by another run.
 
     Notes
     -----
@@ -126,66 +98,44 @@ def build(
     True
     """
     options, report = options or BuildOptions(), progress or silent
-    grid = fleet_grid(fleet, resolution=options.resolution)
-    learned = options.segmenter == "network"
-    weights = find_weights(fleet, options.network) if learned else None
+    learned = options.segmentation.segmenter == "network"
+    weights = find_weights(fleet, options.segmentation.network) if learned else None
     digest = weights.digest if weights else None
-    work = open_workspace(workspace, fleet, options, weights=digest, first=Segmentation.of(options))
-    if (graph := work.read_graph("7-roads")) is not None:
-        return graph
+    with open_workspace(workspace, fleet, options, weights=digest, segmentation=options.segmentation) as work:
+        if (kept := work.read_graph(ROADS)) is not None:
+            return kept
+        return work.finish(ROADS, _built(fleet, options, weights, work, report))
 
-    segmenter = _segmenter(fleet, grid, options, weights, work)
-    probability = _segment(fleet, grid, segmenter, options.gaps, work, report)
-    mask = threshold_mask(probability, threshold=segmenter.threshold, seed_threshold=segmenter.seed_threshold)
-    work.write_raster("2-mask", mask, grid)
+
+def _built(
+    fleet: Fleet, options: BuildOptions, weights: Weights | None, work: Workspace, report: Progress
+) -> RoadGraph:
+    """Build the graph, stage by stage."""
+    grid = fleet_grid(fleet, resolution=options.segmentation.resolution)
+    segmenter = find_segmenter(fleet, grid, options=options.segmentation, weights=weights, workspace=work)
+    probability = centreline_probability(
+        fleet, grid, segmenter, options=options.segmentation, workspace=work, progress=report
+    )
+    threshold, seed_threshold = options.mask.of(segmenter)
+    mask = threshold_mask(probability, threshold=threshold, seed_threshold=seed_threshold)
+    work.write_raster(MASK, mask, grid)
     report("skeleton", 0, 1)
     skeleton = skeletonize_windows(mask, method=cast(Method, options.thinning))
-    work.write_raster("3-skeleton", skeleton, grid)
+    work.write_raster(SKELETON, skeleton, grid)
     report("graph", 0, 1)
     graph = vectorize(skeleton, grid, probability=probability, options=options.vectorize)
-    work.write_graph("4-vectorized", graph)
+    work.write_graph(VECTORIZED, graph)
     graph = clean_graph(graph, options=options.clean)
-    work.write_graph("5-cleaned", graph)
+    work.write_graph(CLEANED, graph)
     report("graph", 1, 1)
     if options.refine:
-        refinement = options.refinement.for_segmenter(learned=weights is not None)
-        graph = refine(graph, fleet, options=refinement, clean=options.clean, workspace=work, progress=report)
-    work.write_graph("7-roads", graph)
+        graph = refine(
+            graph,
+            fleet,
+            learned=weights is not None,
+            options=options.refinement,
+            clean=options.clean,
+            workspace=work,
+            progress=report,
+        )
     return graph
-
-
-def _segmenter(fleet: Fleet, grid: Grid, options: BuildOptions, weights: Weights | None, work: Workspace) -> Segmenter:
-    """Return the segmenter of the options; what the density segmenter estimates is estimated once per run."""
-    if weights is not None:
-        return network_segmenter(weights, grid, options.network)
-    kept = work.read_record("1-density")
-    density = options.density if kept is None else DensityOptions(**kept)
-    segmenter = density_segmenter(fleet, grid, options=density, gaps=options.gaps)
-    if kept is None:
-        work.write_record("1-density", segmenter.parameters)
-    return segmenter
-
-
-def _segment(
-    fleet: Fleet, grid: Grid, segmenter: Segmenter, gaps: TraceGaps, work: Workspace, report: Progress
-) -> NDArray[np.float32]:
-    """Centreline probability of the whole grid ``(rows, cols)``; pages nobody drove on are never touched."""
-    if (kept := work.read_raster("1-probability", grid)) is not None:
-        return kept
-    probability = sparse_zeros(grid.shape, np.float32)
-    driven = 0
-    for window, counts in rasterize_windows(fleet, grid, size=segmenter.window, halo=segmenter.halo, gaps=gaps):
-        report("segmentation", window.row, grid.rows)
-        name = f"window-{window.row}-{window.col}"
-        part = work.read_array(name)
-        if part is None:
-            part = predict_window(segmenter, window, counts, grid)
-            work.write_array(name, part)
-        add_window(probability, part, window, segmenter)
-        driven += 1
-    report("segmentation", grid.rows, grid.rows)
-    total = len(grid.windows(segmenter.window))
-    logger.info("segmented %d windows of %d of %d px (%s)", driven, total, segmenter.window, segmenter.name)
-    work.write_raster("1-probability", probability, grid)
-    work.drop_arrays()
-    return probability

@@ -17,9 +17,10 @@ from probe2road.crs import parse_crs, transform
 from probe2road.fleet.contract import fleet_from_tables
 from probe2road.recipe import BuildOptions, build
 from probe2road.segmentation.density import DensityOptions
+from probe2road.segmentation.options import SegmentationOptions
 
 CRS = "EPSG:32616"
-OPTIONS = BuildOptions(segmenter="density", density=DensityOptions(bandwidth=5.0))
+OPTIONS = BuildOptions(segmentation=SegmentationOptions(segmenter="density", density=DensityOptions(bandwidth=5.0)))
 UNREFINED = replace(OPTIONS, refine=False)
 FEW = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 

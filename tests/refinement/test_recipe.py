@@ -33,7 +33,7 @@ def drives(n: int = 6) -> Fleet:
 
 
 def refined(graph: RoadGraph, **gaps: float) -> RoadGraph:
-    result = refine(graph, drives(), options=RefineOptions(gaps=GapOptions(**gaps)))
+    result = refine(graph, drives(), learned=False, options=RefineOptions(gaps=GapOptions(**gaps)))
     check_graph(result)
     return result
 

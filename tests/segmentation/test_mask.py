@@ -3,7 +3,7 @@ import pytest
 from scipy import ndimage
 
 from probe2road.errors import OptionError
-from probe2road.segmentation.mask import threshold_mask
+from probe2road.segmentation.mask import MaskOptions, threshold_mask
 
 
 def test_parts_without_a_seed_go():
@@ -44,3 +44,16 @@ def test_nothing_gives_nothing():
 def test_thresholds_must_be_in_order():
     with pytest.raises(OptionError, match="below"):
         threshold_mask(np.zeros((2, 2)), threshold=0.5, seed_threshold=0.4)
+
+
+@pytest.mark.parametrize(
+    ("options", "fault"),
+    [
+        ({"threshold": 1.5}, "threshold is 1.5"),
+        ({"seed_threshold": 0.0}, "seed_threshold is 0.0"),
+        ({"threshold": 0.6, "seed_threshold": 0.5}, "threshold 0.6 and seed_threshold 0.5 are not in order"),
+    ],
+)
+def test_mask_options_that_mean_nothing_are_refused(options: dict[str, float], fault: str) -> None:
+    with pytest.raises(OptionError, match=fault):
+        MaskOptions(**options)

@@ -10,7 +10,10 @@ from probe2road.fleet.contract import fleet_from_tables
 from probe2road.raster.counts import fleet_grid, rasterize
 from probe2road.raster.grid import Grid
 from probe2road.recipe import BuildOptions, build
+from probe2road.segmentation import probability
+from probe2road.segmentation.mask import MaskOptions
 from probe2road.segmentation.network import NetworkOptions, find_weights, network_segmenter, shipped_weights
+from probe2road.segmentation.options import SegmentationOptions
 from probe2road.segmentation.tiling import segment_raster
 from probe2road.segmentation.weights import read_weights
 
@@ -39,7 +42,10 @@ def fleet():
 
 def options(path, **changes):
     return BuildOptions(
-        segmenter="network", network=NetworkOptions(weights=str(path), threads=1, **changes), refine=False
+        segmentation=SegmentationOptions(
+            segmenter="network", network=NetworkOptions(weights=str(path), threads=1, **changes)
+        ),
+        refine=False,
     )
 
 
@@ -67,9 +73,7 @@ def test_tiles_agree_with_the_whole(fleet, write_weights):
 def test_a_run_goes_on_where_it_stopped(fleet, write_weights, tmp_path, monkeypatch):
     chosen = options(write_weights(GNSS))
     whole = build(fleet, options=chosen)
-    from probe2road import recipe
-
-    calls, predict = [], recipe.predict_window
+    calls, predict = [], probability.predict_window
 
     def counting(segmenter, window, counts, grid):
         calls.append(window)
@@ -77,10 +81,10 @@ def test_a_run_goes_on_where_it_stopped(fleet, write_weights, tmp_path, monkeypa
             raise KeyboardInterrupt
         return predict(segmenter, window, counts, grid)
 
-    monkeypatch.setattr("probe2road.recipe.predict_window", counting)
+    monkeypatch.setattr("probe2road.segmentation.probability.predict_window", counting)
     with pytest.raises(KeyboardInterrupt):
         build(fleet, options=chosen, workspace=tmp_path / "work")
-    assert len(list((tmp_path / "work").glob("window-*.npz"))) == 4
+    assert len(list((tmp_path / "work").glob("1-window-*.npz"))) == 4
     graph = build(fleet, options=chosen, workspace=tmp_path / "work")
     assert calls[4] == calls[5]
     assert len(calls) - 1 == len(set(calls)) > 8
@@ -153,8 +157,11 @@ def test_options_take_precedence_over_the_model(write_weights):
     own = network_segmenter(weights, grid)
     assert (own.threshold, own.seed_threshold, own.window, own.halo, own.blend) == (0.4, 0.6, 128, 64, True)
     assert own.parameters["model"] == "blur"
-    other = network_segmenter(weights, grid, NetworkOptions(threshold=0.7, tile=512, overlap=0.25))
-    assert (other.threshold, other.seed_threshold, other.window, other.halo) == (0.7, 0.7, 384, 64)
+    other = network_segmenter(weights, grid, NetworkOptions(tile=512, overlap=0.25))
+    assert (other.window, other.halo) == (384, 64)
+    assert MaskOptions().of(own) == (0.4, 0.6)
+    assert MaskOptions(threshold=0.7).of(own) == (0.7, 0.7)
+    assert MaskOptions(seed_threshold=0.8).of(own) == (0.4, 0.8)
 
 
 @pytest.mark.parametrize(
@@ -166,8 +173,6 @@ def test_options_take_precedence_over_the_model(write_weights):
         ({"threads": 0}, "threads is 0"),
         ({"tile": 0}, "tile is 0"),
         ({"tile": 1000}, "model blur: a tile of 1000 px does not suit a stride of 32 px"),
-        ({"threshold": 1.5}, "model blur: threshold 1.5"),
-        ({"threshold": 0.6, "seed_threshold": 0.5}, "model blur: threshold 0.6 and seed_threshold 0.5"),
     ],
 )
 def test_options_that_mean_nothing_are_refused(changes, message, fleet, write_weights):

@@ -163,8 +163,10 @@ def _align(
     steady[touched, :2] = steadying(fleet)[touched]
     fleet = moved_fleet(fleet, steady)
     tiles = find_tiles(fleet, options, touched=touched if held.any() else None)
-    kept = open_workspace(folder, fleet, _Run(options, int(held.sum())))
-    moves = align_tiles(fleet, usable, tiles, options, held=held, workspace=kept, workers=workers, progress=progress)
+    with open_workspace(folder, fleet, _Run(options, int(held.sum()))) as work:
+        moves = align_tiles(
+            fleet, usable, tiles, options, held=held, workspace=work, workers=workers, progress=progress
+        )
     report = make_report(fleet, reasons, held, replace(moves, shift=moves.shift + steady))
     # Held drives do not move, not even by what rounding leaves.
     shift = np.where(touched[:, None], moves.shift, 0.0)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from probe2road.alignment.reckoning import wrapped
 from probe2road.alignment.screening import rows_of_points
 from probe2road.fleet.contract import Fleet
 from probe2road.run.progress import Progress
+from probe2road.run.stages import ALIGNED_TILE
 from probe2road.run.workers import in_processes
 from probe2road.run.workspace import Workspace
 
@@ -69,6 +71,16 @@ class Moves:
     residuals: NDArray[np.float64]
     sights: NDArray[np.int64]
     tiles: int
+
+
+class TileMoves(NamedTuple):
+    """What one tile gives: moves of the n fixes in it, and residuals of the m points that its keyframes saw."""
+
+    row: NDArray[np.int64]  # (n,) of the fixes in the fleet
+    shift: NDArray[np.float64]  # (n, 4) as in `Moves`
+    weight: NDArray[np.float64]  # (n,) which falls to zero at the border
+    seen_from: NDArray[np.int64]  # (m,) rows of the keyframes in the fleet
+    residual: NDArray[np.float64]  # (m, 2) before and after, m
 
 
 def find_tiles(fleet: Fleet, options: AlignOptions, *, touched: NDArray[np.bool_] | None = None) -> list[Tile]:
@@ -136,17 +148,15 @@ def align_tiles(
     total, weight, sights = np.zeros((n, 4)), np.zeros(n), np.zeros(n, np.int64)
     residuals = []
     done = 0
-    for tile, moves, seen in _results(fleet, usable[owner], held, tiles, options, workspace, workers):
-        rows = moves[:, 0].astype(np.int64)
-        share = moves[:, 5]
-        total[rows] += share[:, None] * moves[:, 1:5]
-        weight[rows] += share
+    for tile, moves in _results(fleet, usable[owner], held, tiles, options, workspace, workers):
+        total[moves.row] += moves.weight[:, None] * moves.shift
+        weight[moves.row] += moves.weight
         # A point counts in one tile only: the one in whose core its keyframe is.
         left, bottom, right, top = tile.core
-        x, y = (fleet.traces[axis].to_numpy()[seen[:, 0].astype(np.int64)] for axis in "xy")
-        own = seen[(x >= left) & (x < right) & (y >= bottom) & (y < top)]
-        residuals.append(own)
-        sights += np.bincount(own[:, 0].astype(np.int64), minlength=n)
+        x, y = (fleet.traces[axis].to_numpy()[moves.seen_from] for axis in "xy")
+        own = (x >= left) & (x < right) & (y >= bottom) & (y < top)
+        residuals.append(np.column_stack([moves.seen_from[own], moves.residual[own]]))
+        sights += np.bincount(moves.seen_from[own], minlength=n)
         done += 1
         if progress is not None:
             progress("aligning tiles", done, len(tiles))
@@ -203,15 +213,15 @@ def _results(
     options: AlignOptions,
     workspace: Workspace,
     workers: int,
-) -> Iterator[tuple[Tile, NDArray[np.float64], NDArray[np.float64]]]:
-    """Yield the arrays of every tile: those that an earlier run kept, then the others as they are made."""
+) -> Iterator[tuple[Tile, TileMoves]]:
+    """Yield what every tile gave: those that an earlier run kept, then the others as they are made."""
     missing = []
     for tile in tiles:
-        moves, seen = (workspace.read_array(f"{tile.name}-{part}") for part in ("moves", "residuals"))
-        if moves is None or seen is None:
+        kept = workspace.read_arrays(ALIGNED_TILE, tile.name)
+        if kept is None:
             missing.append(tile)
         else:
-            yield tile, moves, seen
+            yield tile, TileMoves(**kept)
     if len(missing) < len(tiles):
         logger.info("taking %d of %d tiles from an earlier run", len(tiles) - len(missing), len(tiles))
     xy = fleet.traces[["x", "y"]].to_numpy(np.float64)
@@ -222,10 +232,9 @@ def _results(
     )
     jobs = ((tile, *_cut(fleet, held, point_rows, squares, tile), options) for tile in missing)
     made = (_align_tile(*job) for job in jobs) if workers == 1 else in_processes(_align_tile, jobs, workers)
-    for tile, (moves, seen) in zip(missing, made, strict=True):
-        workspace.write_array(f"{tile.name}-residuals", seen)
-        workspace.write_array(f"{tile.name}-moves", moves)
-        yield tile, moves, seen
+    for tile, moves in zip(missing, made, strict=True):
+        workspace.write_arrays(ALIGNED_TILE, tile.name, **moves._asdict())
+        yield tile, moves
 
 
 @dataclass(frozen=True)
@@ -280,18 +289,19 @@ def _cut(
 
 def _align_tile(
     tile: Tile, part: Fleet, rows: NDArray[np.int64], held: NDArray[np.bool_], options: AlignOptions
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Align one tile: row, moves and weight of each fix (n, 6), and residuals as in `Moves`."""
+) -> TileMoves:
+    """Align one tile."""
     if part.n_traces == 0:
-        return np.zeros((0, 6)), np.zeros((0, 3))
+        none = np.zeros(0, np.int64)
+        return TileMoves(none, np.zeros((0, 4)), np.zeros(0), none, np.zeros((0, 2)))
     area = align_area(part, options, held=held)
     shift = _fix_moves(part, area)
     left, bottom, right, top = tile.box
     x, y = (part.traces[axis].to_numpy() for axis in "xy")
     inwards = np.minimum.reduce([x - left, right - x, y - bottom, top - y])
     weight = np.clip(inwards / (2.0 * tile.margin), _LEAST_WEIGHT, 1.0)
-    seen = np.column_stack([rows[area.frames.row[area.residual_keyframe]], area.residual_before, area.residual])
-    return np.column_stack([rows, shift, weight]), seen
+    seen_from = rows[area.frames.row[area.residual_keyframe]]
+    return TileMoves(rows, shift, weight, seen_from, np.column_stack([area.residual_before, area.residual]))
 
 
 def _fix_moves(part: Fleet, area: AlignedArea) -> NDArray[np.float64]:

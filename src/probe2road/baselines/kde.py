@@ -18,8 +18,10 @@ from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster.counts import fleet_grid
+from probe2road.raster.grid import Grid
 from probe2road.run.progress import Progress, silent
-from probe2road.run.workspace import open_workspace
+from probe2road.run.stages import ROADS, VECTORIZED
+from probe2road.run.workspace import Workspace, open_workspace
 
 __all__ = ["KdeOptions", "build_kde"]
 
@@ -97,10 +99,14 @@ def build_kde(
     """
     options, report = options or KdeOptions(), progress or silent
     grid = fleet_grid(fleet, resolution=options.resolution)
-    work = open_workspace(workspace, fleet, options)
-    if (kept := work.read_graph("2-roads")) is not None:
-        return kept
+    with open_workspace(workspace, fleet, options) as work:
+        if (kept := work.read_graph(ROADS)) is not None:
+            return kept
+        return work.finish(ROADS, _built(fleet, grid, options, work, report))
 
+
+def _built(fleet: Fleet, grid: Grid, options: KdeOptions, work: Workspace, report: Progress) -> RoadGraph:
+    """Build the graph of a fleet from its density in space."""
     report("density", 0, 1)
     counts = count_voxels(fleet, grid, height=options.height, gaps=options.gaps)
     pillars = dense_pillars(
@@ -112,9 +118,8 @@ def build_kde(
     graph = graph_from_volume(
         skeleton, grid, floor=counts.floor, height=counts.height, tolerance=options.simplify_tolerance
     )
-    work.write_graph("1-vectorized", graph)
+    work.write_graph(VECTORIZED, graph)
     if options.clean is not None:
         graph = clean_graph(graph, options=options.clean)
-    work.write_graph("2-roads", graph)
     report("graph", 1, 1)
     return graph

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -103,6 +103,7 @@ def build(
     from probe2road.options import load_options
     from probe2road.recipe import BuildOptions
     from probe2road.recipe import build as build_graph
+    from probe2road.run.workspace import resumable
 
     for path in output:
         graph_format(path)
@@ -111,21 +112,18 @@ def build(
     options = load_options(config, BuildOptions) if config else BuildOptions()
     chosen: dict[str, Any] = {"segmenter": segmenter, "resolution": resolution}
     if weights or device:
-        chosen |= _network_choice(options.network, segmenter, weights, device)
-    if not refine:
-        chosen["refine"] = False
-    options = replace(options, **{name: value for name, value in chosen.items() if value is not None})
+        chosen |= _network_choice(options.segmentation.network, segmenter, weights, device)
+    given = {name: value for name, value in chosen.items() if value is not None}
+    options = replace(options, segmentation=replace(options.segmentation, **given), refine=options.refine and refine)
 
     fleet = _read_fleet(traces, points, columns, point_columns, crs, bbox, delimiter, no_header, work_crs)
-    workspace = keep_intermediate or output[0].parent / f".{output[0].name}.probe2road"
-    with progress_bar() as progress:
+    keeping = nullcontext(keep_intermediate) if keep_intermediate else resumable(output[0])
+    with keeping as workspace, progress_bar() as progress:
         graph = build_graph(fleet, options=options, workspace=workspace, progress=progress)
-    for path in output:
-        write_graph(graph, path)
+        for path in output:
+            write_graph(graph, path)
     if keep_intermediate:
         draw_stages(keep_intermediate, fleet, keep_intermediate / "stages.png")
-    else:
-        shutil.rmtree(workspace, ignore_errors=True)
 
 
 @app.command()
@@ -155,23 +153,22 @@ def align(
     from probe2road.io.fleet_reader import read_fleet_files
     from probe2road.io.fleet_writer import write_fleet
     from probe2road.options import load_options
+    from probe2road.run.workspace import resumable
 
     options = load_options(config, AlignOptions) if config else AlignOptions()
     options = replace(options, keep_rejected=False) if drop_rejected else options
     base = read_fleet_files(add_to) if add_to else None
     work_crs = base.crs.to_wkt() if base else None
     fleet = _read_fleet(traces, points, columns, point_columns, crs, bbox, delimiter, no_header, work_crs)
-    workspace = output.parent / f".{output.name}.probe2road"
-    with progress_bar() as progress:
+    with resumable(output) as workspace, progress_bar() as progress:
         kept: dict[str, Any] = {"workspace": workspace, "workers": workers, "progress": progress}
         result = (
             add_drives(base, fleet, options=options, **kept) if base else align_fleet(fleet, options=options, **kept)
         )
-    write_fleet(result.fleet, output)
+        write_fleet(result.fleet, output)
     if report:
         write_report(result.report, report)
         draw_alignment(fleet, result.fleet, report / "alignment.png")
-    shutil.rmtree(workspace, ignore_errors=True)
     typer.echo(json.dumps(result.report.summary, indent=1))
 
 

@@ -9,6 +9,7 @@ from probe2road.fleet.contract import Fleet
 from probe2road.io.graph_files import read_graph
 from probe2road.raster.counts import rasterize
 from probe2road.raster.grid import read_raster
+from probe2road.run.stages import PROBABILITY, ROADS, SKELETON, VECTORIZED
 
 __all__ = ["draw_stages"]
 
@@ -31,14 +32,14 @@ def draw_stages(folder: str | Path, fleet: Fleet, path: str | Path) -> None:
         If a stage is missing.
     """
     folder = Path(folder)
-    probability, grid = read_raster(folder / "1-probability.tif")
-    skeleton, _ = read_raster(folder / "3-skeleton.tif")
+    probability, grid = read_raster(folder / PROBABILITY.file())
+    skeleton, _ = read_raster(folder / SKELETON.file())
     traces = rasterize(fleet, grid)[0]
     panels = [
         Stage("Traces", traces, grid, f"{fleet.n_traces:,} traces, {len(fleet.traces):,} fixes"),
         Stage("Probability", probability[0], grid, "of a centreline"),
         Stage("Skeleton", skeleton[0].astype(bool), grid, f"{int(skeleton.sum()):,} pixels"),
-        Stage("Graph", read_graph(folder / "4-vectorized.gpkg")),
-        Stage("Roads", read_graph(folder / "7-roads.gpkg")),
+        Stage("Graph", read_graph(folder / VECTORIZED.file())),
+        Stage("Roads", read_graph(folder / ROADS.file())),
     ]
     write_filmstrip(panels, path)

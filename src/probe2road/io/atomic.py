@@ -1,17 +1,40 @@
-"""Atomic output: a file or folder that probe2road writes is complete or absent, never half there."""
+"""Atomic output: a file or folder that probe2road writes is complete or absent, never half there.
+
+What is being written lies in a hidden folder beside its target, ``.NAME.HOST-PROCESS-RANDOM.p2r-part``. A process
+that is killed leaves that folder behind; the name says whose it was, so that the next write of the same target can
+tell a leftover from the work of a process that is still alive.
+"""
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 import shutil
+import socket
 import tempfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 
-from probe2road.errors import OutputError
+from probe2road.errors import OutputError, Probe2RoadError
 
-__all__ = ["atomic_path", "make_folder"]
+__all__ = ["atomic_path", "is_workshop", "make_folder", "sweep_leftovers"]
+
+_PART = ".p2r-part"
+_OWNER = re.compile(r"\.(?P<host>[0-9a-f]{8})-(?P<process>\d+)-[^.]*\.p2r-part$")
+_HOST = f"{zlib.crc32(socket.gethostname().encode()):08x}"
+_NO_ROOM = {
+    errno.ENOSPC: "no space left on the device",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "the file is larger than is allowed",
+    errno.EIO: "the device reports an input/output error",
+    errno.EROFS: "the file system is read-only",
+}  # what the disk can refuse, in words
+
+_open_workshops: set[Path] = set()  # of this process
 
 
 @contextmanager
@@ -36,8 +59,8 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     Raises
     ------
     OutputError
-        If the parent folder does not exist or cannot be written, if the block wrote nothing, or if a file
-        would replace a folder or a folder a file.
+        If the parent folder does not exist or cannot be written, if the disk is full or fails, if the block wrote
+        nothing, or if a file would replace a folder or a folder a file.
 
     Examples
     --------
@@ -57,15 +80,88 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     target = Path(path)
     if not target.parent.is_dir():
         raise OutputError(f"folder {target.parent} does not exist", where=target, fix="create it first")
+    sweep_leftovers(target.parent, target.name)
     try:
-        workshop = Path(tempfile.mkdtemp(dir=target.parent, prefix=f".{target.name}."))
+        workshop = Path(
+            tempfile.mkdtemp(dir=target.parent, prefix=f".{target.name}.{_HOST}-{os.getpid()}-", suffix=_PART)
+        )
     except OSError as error:
         raise OutputError(f"folder {target.parent} cannot be written ({error.strerror})", where=target) from error
+    _open_workshops.add(workshop)
     try:
         yield workshop / target.name
         _move(workshop, target)
+    except Probe2RoadError:
+        raise
+    except Exception as error:
+        refusal = _NO_ROOM.get(getattr(error, "errno", None) or 0) or _refusal_of_disk(workshop)
+        if refusal is None:
+            raise
+        fix = "make room, or write somewhere else; what was there before is untouched"
+        raise OutputError(f"cannot be written: {refusal}", where=target, fix=fix) from error
     finally:
+        _open_workshops.discard(workshop)
         shutil.rmtree(workshop, ignore_errors=True)
+
+
+def _refusal_of_disk(folder: Path) -> str | None:
+    """Say why the disk takes nothing more, or None where it does: libraries hide the reason behind one of their own."""
+    probe = folder / "probe"
+    try:
+        with probe.open("wb") as file:
+            file.write(bytes(1 << 16))
+            os.fsync(file.fileno())
+        probe.unlink()
+    except OSError as error:
+        return _NO_ROOM.get(error.errno or 0)
+    return None
+
+
+def is_workshop(path: Path) -> bool:
+    """Whether `atomic_path` made this folder, in whatever process."""
+    return _OWNER.search(path.name) is not None
+
+
+def sweep_leftovers(folder: Path, name: str | None = None) -> None:
+    """Remove what killed processes left behind when they wrote into a folder.
+
+    Only folders that `atomic_path` made on this machine, and whose process is gone, are removed.
+
+    Parameters
+    ----------
+    folder
+        Where the files are, or would have been.
+    name
+        Of the one file whose leftovers go; all of them where it is None.
+
+    Examples
+    --------
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> for process in (os.getpid() + 10**7, 1):  # one that cannot be alive, one that always is
+    ...     (folder / f".roads.gpkg.{_HOST}-{process}-abc.p2r-part").mkdir()
+    >>> sweep_leftovers(folder, "roads.gpkg")
+    >>> len(list(folder.iterdir()))
+    1
+    """
+    for path in folder.glob(f".*{_PART}"):
+        owner = _OWNER.search(path.name)
+        if owner is None or owner["host"] != _HOST or name not in (None, path.name[1 : owner.start()]):
+            continue
+        if path not in _open_workshops and not _is_alive(int(owner["process"])):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _is_alive(process: int) -> bool:
+    """Whether another process of this number runs; this process knows its own workshops."""
+    if process == os.getpid():
+        return False
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def _move(workshop: Path, target: Path) -> None:
@@ -76,8 +172,10 @@ def _move(workshop: Path, target: Path) -> None:
     if target.exists() and target.is_dir() != written.is_dir():
         kinds = ("a folder", "a file") if target.is_dir() else ("a file", "a folder")
         raise OutputError(f"is {kinds[0]}, and {kinds[1]} would replace it", where=target, fix="choose another name")
+    _make_durable(written)
     if not target.is_dir():
         written.replace(target)
+        _sync(target.parent)
         return
     # A folder that is not empty cannot be replaced in one step: set it aside, and back if the move fails.
     aside = workshop / f"{target.name}.old"
@@ -87,6 +185,21 @@ def _move(workshop: Path, target: Path) -> None:
     except OSError:
         aside.replace(target)
         raise
+    _sync(target.parent)
+
+
+def _make_durable(written: Path) -> None:
+    """Have a file, or all of a folder, on the disk before its name is: a crash of the machine leaves old or new."""
+    for path in [*written.rglob("*"), written] if written.is_dir() else [written]:
+        _sync(path)
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def make_folder(path: Path) -> None:

@@ -26,7 +26,7 @@ from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table
 from probe2road.io.graph_writers import parquet_siblings
 
-__all__ = ["graph_from_table", "read_parquet_graph", "read_vector_graph"]
+__all__ = ["graph_from_table", "read_note", "read_parquet_graph", "read_vector_graph"]
 
 logger = logging.getLogger(__name__)
 
@@ -72,6 +72,18 @@ def read_vector_graph(
         if table.empty:  # without features there are no columns either
             return empty_graph(target_crs)
     return graph_from_table(table, nodes=nodes, turns=turns, crs=crs, target_crs=target_crs, where=path)
+
+
+def read_note(path: str | PathLike[str], name: str) -> str | None:
+    """Return a note that `probe2road.io.graph_writers.write_geopackage` put into a file, or None.
+
+    None also where the file cannot be read.
+    """
+    try:
+        notes = pyogrio.read_info(path, layer="edges")["layer_metadata"] or {}
+    except (DataSourceError, DataLayerError):
+        return None
+    return notes.get(name)
 
 
 def read_parquet_graph(path: str | PathLike[str], *, crs: Any = None, target_crs: Any = None) -> RoadGraph:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -49,8 +50,10 @@ logger = logging.getLogger(__name__)
 GEOJSON_DECIMALS = 8  # of a degree: 1 mm
 
 
-def write_geopackage(graph: RoadGraph, path: str | PathLike[str]) -> None:
+def write_geopackage(graph: RoadGraph, path: str | PathLike[str], *, note: Mapping[str, str] | None = None) -> None:
     """Write the layers ``nodes`` and ``edges`` and the attribute table ``turns`` to a GeoPackage.
+
+    Notes go into the metadata of the edges, where `probe2road.io.graph_readers.read_note` finds them.
 
     Raises
     ------
@@ -69,6 +72,7 @@ def write_geopackage(graph: RoadGraph, path: str | PathLike[str]) -> None:
                 driver="GPKG",
                 append=layer != "edges",
                 geometry_type={"edges": _line_type(graph), "nodes": _point_type(graph)}.get(layer),
+                layer_metadata=dict(note) if note and layer == "edges" else None,
             )
 
 

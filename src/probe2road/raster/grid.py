@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from probe2road.crs import parse_crs, require_metric
 from probe2road.errors import InputError, OptionError
 from probe2road.io.atomic import atomic_path
 
-__all__ = ["Grid", "Window", "read_raster", "sparse_zeros", "write_raster"]
+__all__ = ["Grid", "Window", "read_raster", "read_tag", "sparse_zeros", "write_raster"]
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,13 @@ class Window:
 
 
 def write_raster(
-    path: str | Path, array: NDArray[Any], grid: Grid, *, names: Sequence[str] = (), nodata: float | None = None
+    path: str | Path,
+    array: NDArray[Any],
+    grid: Grid,
+    *,
+    names: Sequence[str] = (),
+    nodata: float | None = None,
+    tags: Mapping[str, str] | None = None,
 ) -> None:
     """Write a raster as a compressed, tiled GeoTIFF that QGIS opens in place; the file is complete or absent.
 
@@ -149,6 +155,8 @@ def write_raster(
         One description per channel, or none.
     nodata
         Value to show as transparent.
+    tags
+        Notes that the file carries.
     """
     import rasterio
 
@@ -171,6 +179,7 @@ def write_raster(
             target.write(band.astype(profile["dtype"], copy=False), number)
         for number, name in enumerate(names, start=1):
             target.set_band_description(number, name)
+        target.update_tags(**tags or {})
 
 
 def sparse_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
@@ -192,6 +201,18 @@ def sparse_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
         return np.zeros(shape, dtype)
     memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     return np.frombuffer(memory, dtype).reshape(shape)
+
+
+def read_tag(path: str | Path, name: str) -> str | None:
+    """Return a note that `write_raster` put into a file; None where there is none, or no readable file."""
+    import rasterio
+
+    try:
+        with rasterio.open(path) as source:
+            value = source.tags().get(name)
+    except rasterio.errors.RasterioError:
+        return None
+    return None if value is None else str(value)
 
 
 def read_raster(path: str | Path) -> tuple[NDArray[Any], Grid]:

@@ -8,6 +8,8 @@ edge and every turn was driven.
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from probe2road.errors import OptionError
@@ -24,11 +26,12 @@ from probe2road.refinement.junctions.passages import passing_positions
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
 from probe2road.refinement.undriven import RungOptions, drop_undriven
 from probe2road.run.progress import Progress, silent
+from probe2road.run.stages import GAPS_FILLED, Stage
 from probe2road.run.workspace import Workspace
 
 __all__ = ["RefineOptions", "refine"]
 
-_SPLITS = 2  # how often junctions are split
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class RefineOptions:
     braids: BraidOptions = field(default_factory=BraidOptions)  # which chains of edges are roads side by side
     forks: ForkOptions = field(default_factory=ForkOptions)  # which forks are moved to where traces part
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)  # what counts as having driven an edge
-    move: bool | None = None  # whether edges move to the middle of what was driven; None: see `for_segmenter`
+    move: bool | None = None  # whether edges move to the middle of what was driven; None: see `settled`
     centreline: CentrelineOptions = field(default_factory=CentrelineOptions)  # how far they may
 
     def __post_init__(self) -> None:
@@ -54,8 +57,8 @@ class RefineOptions:
             fix = "use a number above 0, up to 1"
             raise OptionError(f"gap_weight is {self.gap_weight}", where="RefineOptions", fix=fix)
 
-    def for_segmenter(self, *, learned: bool) -> RefineOptions:
-        """Settle what is None.
+    def settled(self, *, learned: bool) -> RefineOptions:
+        """Settle what is None by where the lines of the graph come from.
 
         A network has learned where the middle of a road is, and what it adds to the roads are rungs and fragments that
         nobody drives on. The lines of density lie where the traces do, and where these are few none may be matched.
@@ -67,10 +70,104 @@ class RefineOptions:
         )
 
 
+@dataclass(frozen=True)
+class _Stand:
+    """What a step has to work with: the graph as it stands, and the fleet's matches to it."""
+
+    graph: RoadGraph
+    fleet: Fleet
+    matches: Matches
+    options: RefineOptions
+    clean: CleanOptions | None
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One step of the refinement.
+
+    Attributes
+    ----------
+    name
+        For the log.
+    apply
+        Returns another graph, or the same object where there was nothing to do.
+    proposed
+        Whether the graph holds links that are only proposed: traces then drive through them reluctantly.
+    follows
+        Whether it is left out where the step before changed nothing.
+    keeps_roads
+        Whether edges and nodes stay the same, so that the matches stay valid.
+    stage
+        Under which the graph is kept after it.
+    """
+
+    name: str
+    apply: Callable[[_Stand], RoadGraph]
+    proposed: bool = False
+    follows: bool = False
+    keeps_roads: bool = False
+    stage: Stage | None = None
+
+
+def _fill_jumps(at: _Stand) -> RoadGraph:
+    return fill_jumps(at.graph, at.matches.steps, options=at.options.gaps)
+
+
+def _prune_gaps(at: _Stand) -> RoadGraph:
+    return clean_graph(prune_gaps(at.graph, at.matches.steps, min_traces=at.options.min_traces), options=at.clean)
+
+
+def _split_junctions(at: _Stand) -> RoadGraph:
+    positions = passing_positions(at.graph, at.fleet, at.matches)
+    split = split_false_junctions(at.graph, at.matches.steps, positions=positions, options=at.options.junctions)
+    same = (len(split.nodes), len(split.edges)) == (len(at.graph.nodes), len(at.graph.edges))
+    return at.graph if same else split
+
+
+def _drop_undriven(at: _Stand) -> RoadGraph:
+    least = at.options.min_support or 0
+    driven = drop_undriven(at.graph, at.matches.steps, min_traces=least, rungs=at.options.rungs if least else None)
+    return driven if driven is at.graph else clean_graph(driven, options=at.clean)
+
+
+def _open_braids(at: _Stand) -> RoadGraph:
+    return open_braids(at.graph, at.matches.steps, options=at.options.braids)
+
+
+def _move_forks(at: _Stand) -> RoadGraph:
+    return move_forks(at.graph, at.fleet, at.matches, options=at.options.forks)
+
+
+def _add_evidence(at: _Stand) -> RoadGraph:
+    return add_evidence(at.graph, at.fleet, at.matches, options=at.options.evidence)
+
+
+def _move_edges(at: _Stand) -> RoadGraph:
+    if not at.options.move:
+        return at.graph
+    return refine_centreline(at.graph, at.fleet, at.matches, options=at.options.centreline)
+
+
+# What is split and dropped the first time may have hidden further false junctions: both come twice.
+_STEPS = (
+    _Step("fill jumps", _fill_jumps, proposed=True),
+    _Step("prune gaps", _prune_gaps, proposed=True, stage=GAPS_FILLED),
+    _Step("split junctions", _split_junctions),
+    _Step("drop undriven edges", _drop_undriven),
+    _Step("split junctions again", _split_junctions),
+    _Step("drop undriven edges again", _drop_undriven, follows=True),
+    _Step("open braids", _open_braids),
+    _Step("move forks", _move_forks),
+    _Step("add evidence", _add_evidence, keeps_roads=True),
+    _Step("move edges", _move_edges, keeps_roads=True),
+)
+
+
 def refine(
     graph: RoadGraph,
     fleet: Fleet,
     *,
+    learned: bool,
     options: RefineOptions | None = None,
     clean: CleanOptions | None = None,
     workspace: Workspace | None = None,
@@ -81,17 +178,20 @@ def refine(
     Parameters
     ----------
     graph
-        From `probe2road.vectorize.lines`, or any other without evidence.
+        From `probe2road.vectorize.lines.vectorize`, or any other without evidence.
     fleet
         The fleet, in the graph's CRS.
+    learned
+        Whether the lines come from a network that has learned where the middle of a road is, or from the density of
+        traces. It settles what is None in the options; see `RefineOptions.settled`.
     options
-        The defaults where it is None; what is None in them is settled as for the density segmenter.
+        The defaults where it is None.
     clean
         How the graph is cleaned once its gaps are filled.
     workspace
-        Where the graph of every step is kept.
+        Where the graph with filled gaps is kept.
     progress
-        Called as the work goes on.
+        Called with the number of steps that are done.
 
     Returns
     -------
@@ -106,49 +206,43 @@ def refine(
     Notes
     -----
     Paper, section III-B; METHOD 0.1 rows 16 to 27, in the order of row 27.
+
+    Examples
+    --------
+    >>> from probe2road.demo import demo_fleet
+    >>> from probe2road.graph.roadgraph import graph_from_lines
+    >>> fleet = demo_fleet(n_drives=20)
+    >>> left, bottom, right, top = fleet.bounds
+    >>> straight = graph_from_lines([[(left, bottom), (right, top)]], crs=fleet.crs)
+    >>> refine(straight, fleet, learned=False).edges["support"].notna().tolist()
+    [True]
     """
-    options, work = (options or RefineOptions()).for_segmenter(learned=False), workspace or Workspace(None)
+    options, work = (options or RefineOptions()).settled(learned=learned), workspace or Workspace()
     report = progress or silent
     if graph.edges.empty:
         return graph
-    report("matching", 0, 6)
-    filled = fill_gaps(graph, options=options.gaps)
-    matches = _matched(fleet, filled, options)
-    jumped = fill_jumps(filled, matches.steps, options=options.gaps)
-    if jumped is not filled:
-        filled, matches = jumped, _matched(fleet, jumped, options)
-    graph = clean_graph(prune_gaps(filled, matches.steps, min_traces=options.min_traces), options=clean)
-    work.write_graph("6-gaps-filled", graph)
-
-    # What is split and dropped the first time may have hidden further false junctions.
-    matches = match(graph, fleet, options=options.matching)
-    for turn in range(_SPLITS):
-        report("matching", 1 + 2 * turn, 6)
-        positions = passing_positions(graph, fleet, matches)
-        split = split_false_junctions(graph, matches.steps, positions=positions, options=options.junctions)
-        if turn and (len(split.nodes), len(split.edges)) == (len(graph.nodes), len(graph.edges)):
-            break
-        graph, matches = split, match(split, fleet, options=options.matching)
-        report("matching", 2 + 2 * turn, 6)
-        rungs = options.rungs if options.min_support else None
-        driven = drop_undriven(graph, matches.steps, min_traces=options.min_support or 0, rungs=rungs)
-        if driven is not graph:
-            graph = clean_graph(driven, options=clean)
-            matches = match(graph, fleet, options=options.matching)
-    report("matching", 5, 6)
-    opened = open_braids(graph, matches.steps, options=options.braids)
-    if opened is not graph:
-        graph, matches = opened, match(opened, fleet, options=options.matching)
-    moved = move_forks(graph, fleet, matches, options=options.forks)
-    if moved is not graph:
-        graph, matches = moved, match(moved, fleet, options=options.matching)
-    graph = add_evidence(graph, fleet, matches, options=options.evidence)
-    if options.move:
-        graph = refine_centreline(graph, fleet, matches, options=options.centreline)
-    report("matching", 6, 6)
+    report("refinement", 0, len(_STEPS))
+    graph = fill_gaps(graph, options=options.gaps)
+    matches: Matches | None = None
+    weighted = changed = True
+    for number, step in enumerate(_STEPS, start=1):
+        if step.follows and not changed:
+            continue
+        if matches is None or weighted != step.proposed:
+            matches, weighted = _matched(graph, fleet, options, proposed=step.proposed), step.proposed
+        result = step.apply(_Stand(graph, fleet, matches, options, clean))
+        changed = result is not graph
+        if changed and not step.keeps_roads:
+            logger.info("%s: %d nodes and %d edges", step.name, len(result.nodes), len(result.edges))
+            matches = None
+        graph = result
+        if step.stage is not None:
+            work.write_graph(step.stage, graph)
+        report("refinement", number, len(_STEPS))
     return graph
 
 
-def _matched(fleet: Fleet, graph: RoadGraph, options: RefineOptions) -> Matches:
-    """Match to a graph with proposed links."""
-    return match(graph, fleet, options=options.matching, edge_weights=gap_weights(graph, gap=options.gap_weight))
+def _matched(graph: RoadGraph, fleet: Fleet, options: RefineOptions, *, proposed: bool) -> Matches:
+    """Match the fleet; links that are only proposed are driven reluctantly."""
+    weights = gap_weights(graph, gap=options.gap_weight) if proposed else None
+    return match(graph, fleet, options=options.matching, edge_weights=weights)

@@ -1,9 +1,10 @@
 """What the stages of one run leave behind, so that the next run can go on from there.
 
-A workspace is a folder with one file per stage and the fingerprint of the fleet, options and weights that made them.
-Files are written atomically, so whatever is there is complete. A folder with another fingerprint is emptied
-of its stage files first: stages of two runs never mix. What the first stage made, which is most of the work, stays
-where only options of later stages changed.
+A workspace is a folder with a mark of its own and the files of `probe2road.run.stages`; no other file in it is ever
+touched. Files are written atomically, so whatever is there is complete, and each names the fingerprint of the fleet,
+options and weights that made it: a file of another run is as good as absent. What the segmentation made, which is most
+of the work, has a fingerprint without the options of later stages, and so stays where only these changed. One run at a
+time holds a workspace.
 """
 
 from __future__ import annotations
@@ -11,50 +12,90 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 import shutil
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import pandas as pd
+from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
 from probe2road.errors import OutputError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.io.atomic import atomic_path, make_folder
-from probe2road.io.graph_files import read_graph, write_graph
-from probe2road.raster.grid import Grid, read_raster, write_raster
+from probe2road.io.atomic import atomic_path, is_workshop, make_folder, sweep_leftovers
+from probe2road.io.graph_files import read_graph
+from probe2road.io.graph_readers import read_note
+from probe2road.io.graph_writers import write_geopackage
+from probe2road.raster.grid import Grid, read_raster, read_tag, write_raster
+from probe2road.run.stages import Stage, stage_of
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["Workspace", "copy_first_stage", "fingerprint", "open_workspace"]
+__all__ = ["Workspace", "copy_segmentation", "fingerprint", "open_workspace", "resumable"]
 
 logger = logging.getLogger(__name__)
 
-
-_MARK = "run.json"
-_FIRST = ("1-", "window-")  # how the files of the first stage begin
-_FORMAT = 3  # raised when what a stage writes changes
+_MARK, _LOCK = "workspace.json", "workspace.lock"
+_RUN = "probe2road_run"  # under which a file names the fingerprint of its run
+_FORMAT = 4  # raised when what a stage writes changes
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """A folder for stage files; with no folder, nothing is kept and nothing is found."""
+    """A folder for the files of stages; with no folder, nothing is kept and nothing is found.
 
-    folder: Path | None
+    Attributes
+    ----------
+    folder
+        Where the files are, or None.
+    run, segmentation
+        Fingerprints of the run, and of what its probability depends on.
+    lock
+        Held while the workspace is open.
 
-    def write_raster(self, name: str, array: NDArray[Any], grid: Grid) -> None:
-        """Keep a raster as ``NAME.tif``."""
+    Examples
+    --------
+    >>> from probe2road.run.stages import ROADS
+    >>> with Workspace() as work:
+    ...     print(work.read_graph(ROADS))
+    None
+    """
+
+    folder: Path | None = None
+    run: str = ""
+    segmentation: str = ""
+    lock: FileLock | None = None
+
+    def __enter__(self) -> Self:
+        """Return the workspace; it is open already."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Let other runs have the folder."""
+        if self.lock is not None:
+            self.lock.release()
+
+    def write_raster(self, stage: Stage, array: NDArray[Any], grid: Grid) -> None:
+        """Keep a raster."""
         if self.folder is not None:
-            write_raster(self.folder / f"{name}.tif", array, grid, names=[name])
+            tags = {_RUN: self._fingerprint(stage)}
+            write_raster(self.folder / stage.file(), array, grid, names=[stage.name], tags=tags)
 
-    def read_raster(self, name: str, grid: Grid) -> NDArray[Any] | None:
-        """Return the one band of a raster an earlier run kept on this grid, or None."""
-        path = None if self.folder is None else self.folder / f"{name}.tif"
-        if path is None or not path.exists():
+    def read_raster(self, stage: Stage, grid: Grid) -> NDArray[Any] | None:
+        """Return the one band of a raster that an earlier run kept on this grid, or None."""
+        path = self._kept(stage)
+        if path is None or read_tag(path, _RUN) != self._fingerprint(stage):
             return None
         array, kept_grid = read_raster(path)
         if kept_grid.shape != grid.shape:
@@ -62,49 +103,66 @@ class Workspace:
         logger.info("taking %s from an earlier run", path.name)
         return array[0]
 
-    def write_graph(self, name: str, graph: RoadGraph) -> None:
-        """Keep a graph as ``NAME.gpkg``."""
+    def write_graph(self, stage: Stage, graph: RoadGraph) -> None:
+        """Keep a graph."""
         if self.folder is not None:
-            write_graph(graph, self.folder / f"{name}.gpkg")
+            write_geopackage(graph, self.folder / stage.file(), note={_RUN: self._fingerprint(stage)})
 
-    def read_graph(self, name: str) -> RoadGraph | None:
-        """Return a graph an earlier run kept, or None."""
-        path = None if self.folder is None else self.folder / f"{name}.gpkg"
-        if path is None or not path.exists():
+    def read_graph(self, stage: Stage) -> RoadGraph | None:
+        """Return a graph that an earlier run kept, or None."""
+        path = self._kept(stage)
+        if path is None or read_note(path, _RUN) != self._fingerprint(stage):
             return None
         logger.info("taking %s from an earlier run", path.name)
         return read_graph(path)
 
-    def write_array(self, name: str, array: NDArray[Any]) -> None:
-        """Keep an array as ``NAME.npz``, compressed: what is kept on the way is many times what is kept at the end."""
-        if self.folder is not None:
-            with atomic_path(self.folder / f"{name}.npz") as temporary:
-                np.savez_compressed(temporary, array)
+    def finish(self, stage: Stage, graph: RoadGraph) -> RoadGraph:
+        """Keep the result of a run and return it as a run that goes on from it would: equal to the last byte."""
+        self.write_graph(stage, graph)
+        return graph if self.folder is None else read_graph(self.folder / stage.file())
 
-    def read_array(self, name: str) -> NDArray[Any] | None:
-        """Return an array an earlier run kept, or None."""
-        path = None if self.folder is None else self.folder / f"{name}.npz"
-        if path is None or not path.exists():
+    def write_arrays(self, stage: Stage, part: str, **arrays: NDArray[Any]) -> None:
+        """Keep arrays of one part, compressed: what is kept on the way is many times what is kept at the end."""
+        if self.folder is not None:
+            with atomic_path(self.folder / stage.file(part)) as temporary:
+                named: dict[str, Any] = {_RUN: np.array(self._fingerprint(stage)), **arrays}
+                np.savez_compressed(temporary, **named)
+
+    def read_arrays(self, stage: Stage, part: str) -> dict[str, NDArray[Any]] | None:
+        """Return the arrays of one part that an earlier run kept, or None."""
+        path = self._kept(stage, part)
+        if path is None:
             return None
-        with np.load(path) as arrays:
-            return np.asarray(arrays["arr_0"])
+        with np.load(path) as file:
+            arrays = {name: np.asarray(file[name]) for name in file.files}
+        return arrays if str(arrays.pop(_RUN, "")) == self._fingerprint(stage) else None
 
-    def drop_arrays(self) -> None:
-        """Remove the arrays, once a raster holds them all."""
+    def drop(self, stage: Stage) -> None:
+        """Remove the files of a stage, once a later one holds what is in them."""
         if self.folder is not None:
-            for path in self.folder.glob("*.npz"):
-                path.unlink()
+            for path in self.folder.iterdir():
+                if stage_of(path.name) is stage:
+                    path.unlink()
 
-    def write_record(self, name: str, record: dict[str, Any]) -> None:
-        """Keep what a stage was configured with as ``NAME.json``."""
+    def write_record(self, stage: Stage, record: Mapping[str, Any]) -> None:
+        """Keep what a stage was configured with."""
         if self.folder is not None:
-            with atomic_path(self.folder / f"{name}.json") as temporary:
-                temporary.write_text(json.dumps(record, indent=1))
+            with atomic_path(self.folder / stage.file()) as temporary:
+                temporary.write_text(json.dumps({_RUN: self._fingerprint(stage), **record}, indent=1))
 
-    def read_record(self, name: str) -> dict[str, Any] | None:
-        """Return a record an earlier run kept, or None."""
-        path = None if self.folder is None else self.folder / f"{name}.json"
-        return None if path is None or not path.exists() else json.loads(path.read_text())
+    def read_record(self, stage: Stage) -> dict[str, Any] | None:
+        """Return a record that an earlier run kept, or None."""
+        path = self._kept(stage)
+        record = {} if path is None else dict(json.loads(path.read_text()))
+        return record if record.pop(_RUN, None) == self._fingerprint(stage) else None
+
+    def _kept(self, stage: Stage, part: str = "") -> Path | None:
+        """Return the file of a stage, or None where there is none."""
+        path = None if self.folder is None else self.folder / stage.file(part)
+        return path if path is not None and path.exists() else None
+
+    def _fingerprint(self, stage: Stage) -> str:
+        return self.segmentation if stage.segmentation else self.run
 
 
 def open_workspace(
@@ -113,9 +171,12 @@ def open_workspace(
     options: DataclassInstance,
     *,
     weights: str | None = None,
-    first: DataclassInstance | None = None,
+    segmentation: DataclassInstance | None = None,
 ) -> Workspace:
-    """Open the workspace of a run, empty unless it belongs to the same fleet, options and weights.
+    """Open the workspace of a run; close it by leaving its ``with`` block.
+
+    Files of stages that belong to another fleet, other options or other weights are removed; so is what killed
+    processes left behind. Everything else in the folder stays as it is.
 
     Parameters
     ----------
@@ -125,50 +186,142 @@ def open_workspace(
         What the run works on.
     weights
         Digest of the network's weights, if the run uses one.
-    first
-        The options that the first stage depends on. Its files stay where these, the fleet and the weights are the same.
+    segmentation
+        The options that decide the probability. Its files stay where these, the fleet and the weights are the same.
         Without them all options count for all files.
 
     Raises
     ------
     OutputError
-        If the folder has files in it but is not a workspace, or cannot be created.
+        If the folder has files in it but is not a workspace, if another run holds it, or if it cannot be created.
     """
     if folder is None:
-        return Workspace(None)
+        return Workspace()
     folder = Path(folder)
-    mark = {"format": _FORMAT, "fleet": fingerprint(fleet), "weights": weights}
-    mark |= {"options": asdict(options), "first": asdict(first or options)}
-    mark = json.loads(json.dumps(mark))  # tuples become lists, as they are in a file
+    base = {"format": _FORMAT, "fleet": fingerprint(fleet), "weights": weights}
+    mark: dict[str, Any] = {
+        "program": "probe2road",
+        "run": _digest({**base, "options": asdict(options)}),
+        "segmentation": _digest({**base, "options": asdict(segmentation or options)}),
+        "options": asdict(options),
+        "process": os.getpid(),
+        "host": socket.gethostname(),
+    }
     make_folder(folder)
-    path = folder / _MARK
-    if not path.exists() and any(folder.iterdir()):
-        raise OutputError("the folder is not empty and not a workspace", where=folder, fix="name an empty folder")
-    if path.exists() and (kept := json.loads(path.read_text())) != mark:
-        stays = _FIRST if all(kept.get(name) == mark[name] for name in mark if name != "options") else ()
-        logger.info("%s belongs to another run: %s", folder, "keeping its first stage" if stays else "starting afresh")
-        for file in folder.iterdir():
-            if file.suffix in (".tif", ".gpkg", ".npz", ".npy", ".json", ".png") and not file.name.startswith(stays):
-                file.unlink()
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(mark, indent=1))
-    return Workspace(folder)
+    _require_ours(folder)
+    lock = _locked(folder)
+    sweep_leftovers(folder)
+    for path in folder.iterdir():
+        if _is_leftover(path) and not is_workshop(path):
+            path.rmdir()
+    kept = _read_mark(folder)
+    if kept is not None and kept["run"] != mark["run"]:
+        stays = kept["segmentation"] == mark["segmentation"]
+        logger.info("%s belongs to another run: %s", folder, "keeping its probability" if stays else "starting afresh")
+        for path in folder.iterdir():
+            stage = stage_of(path.name)
+            if stage is not None and not (stays and stage.segmentation):
+                path.unlink()
+    with atomic_path(folder / _MARK) as temporary:
+        temporary.write_text(json.dumps(mark, indent=1, default=str))
+    return Workspace(folder, mark["run"], mark["segmentation"], lock)
 
 
-def copy_first_stage(folder: Path, target: Path) -> None:
-    """Start a workspace with the first stage of another, for a run that differs only in options of later stages.
+def _require_ours(folder: Path) -> None:
+    """Refuse a folder that holds anything but is no workspace."""
+    if _read_mark(folder) is not None:
+        return
+    foreign = sorted(path.name for path in folder.iterdir() if path.name != _LOCK and not _is_leftover(path))
+    if foreign:
+        fault = f"the folder is not empty and not a workspace: it holds {foreign[0]}"
+        raise OutputError(fault, where=folder, fix="name an empty folder, or one that does not exist")
+
+
+def _read_mark(folder: Path) -> dict[str, Any] | None:
+    """Return what the mark of a workspace says, or None where the folder has none."""
+    try:
+        mark = json.loads((folder / _MARK).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return mark if isinstance(mark, dict) and {"program", "run", "segmentation"} <= set(mark) else None
+
+
+def _is_leftover(path: Path) -> bool:
+    """Whether a run that was killed left this behind: a hidden folder of ours, or one with nothing in it."""
+    return path.name.startswith(".") and path.is_dir() and (is_workshop(path) or not any(path.iterdir()))
+
+
+def _locked(folder: Path) -> FileLock:
+    """Hold the folder for this process; the lock of one that died is free."""
+    lock = FileLock(folder / _LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        mark = _read_mark(folder) or {}
+        holder = f"process {mark['process']} on {mark['host']}" if "process" in mark else "another process"
+        fault = f"{holder} is working in this folder"
+        raise OutputError(fault, where=folder, fix="wait until it is done, or name another folder") from error
+    except OSError as error:
+        raise OutputError(f"cannot be locked ({error.strerror})", where=folder) from error
+    return lock
+
+
+@contextmanager
+def resumable(output: str | Path) -> Iterator[Path]:
+    """Give long work a hidden workspace beside its output, which is removed when the block ends without an error.
+
+    An error or a kill leaves the workspace, so that the same call goes on from there.
+
+    Parameters
+    ----------
+    output
+        File that the work will write, in a folder that exists.
+
+    Yields
+    ------
+    Path
+        Folder for the argument ``workspace`` of a verb.
+
+    Raises
+    ------
+    OutputError
+        If the folder of the output does not exist.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import probe2road as p2r
+    >>> from probe2road.demo import demo_fleet
+    >>> output = Path(tempfile.mkdtemp(), "roads.gpkg")
+    >>> options = p2r.BuildOptions(segmentation=p2r.SegmentationOptions(segmenter="density"))
+    >>> with resumable(output) as folder:
+    ...     p2r.write_graph(p2r.build(demo_fleet(n_drives=20), options=options, workspace=folder), output)
+    >>> [path.name for path in output.parent.iterdir()]
+    ['roads.gpkg']
+    """
+    output = Path(output)
+    if not output.parent.is_dir():
+        raise OutputError(f"folder {output.parent} does not exist", where=output, fix="create it first")
+    folder = output.parent / f".{output.name}.probe2road"
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def copy_segmentation(folder: Path, target: Path) -> None:
+    """Start a workspace with the probability of another, for a run that differs only in options of later stages.
 
     Parameters
     ----------
     folder
-        Workspace whose first stage is complete.
+        Workspace whose segmentation is complete.
     target
         The new workspace. `open_workspace` empties it if the run differs in more.
     """
     with atomic_path(target) as temporary:
         temporary.mkdir()
         for file in folder.iterdir():
-            if file.name == _MARK or file.name.startswith(_FIRST):
+            stage = stage_of(file.name)
+            if file.name == _MARK or (stage is not None and stage.segmentation):
                 shutil.copy(file, temporary)
 
 
@@ -189,3 +342,8 @@ def fingerprint(fleet: Fleet) -> str:
             digest.update(name.encode())
             digest.update(pd.util.hash_pandas_object(table[name], index=False).to_numpy().tobytes())
     return digest.hexdigest()
+
+
+def _digest(record: Mapping[str, Any]) -> str:
+    """Return a digest of what decides a run."""
+    return hashlib.blake2b(json.dumps(record, default=str).encode(), digest_size=16).hexdigest()

@@ -41,6 +41,8 @@ logger = logging.getLogger(__name__)
 
 _TRUNCATE = 4.5  # kernel half-width, bandwidths; a shorter one ends in a step that curves like a ridge
 _CLOSE_BY = 1 / 3  # bandwidths
+_THRESHOLD = 0.5  # probability that continues a road
+_SEED_THRESHOLD = 0.67  # probability that starts one: three traces on a ridge
 _WINDOW = 1024  # pixels; no influence on the result
 
 
@@ -52,19 +54,11 @@ class DensityOptions:
     half_evidence: float = 1.0  # traces on a ridge at which the probability is one half
     half_presence: float = 0.3  # traces close by at which it is one half
     half_ridge: float = 0.3  # relative curvature at which it is one half
-    threshold: float = 0.5  # probability that continues a road
-    seed_threshold: float = 0.67  # probability that starts one: three traces on a ridge
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing."""
         if self.bandwidth is not None and not self.bandwidth > 0:
             raise OptionError(f"bandwidth is {self.bandwidth} m", where="DensityOptions", fix="use metres above 0")
-        if not 0 < self.threshold <= self.seed_threshold < 1:
-            raise OptionError(
-                f"threshold {self.threshold} and seed_threshold {self.seed_threshold} are not in order",
-                where="DensityOptions",
-                fix="use 0 < threshold <= seed_threshold < 1",
-            )
 
 
 def density_segmenter(
@@ -103,8 +97,8 @@ def density_segmenter(
         window=_WINDOW,
         halo=_halo(settled.bandwidth, grid),
         blend=False,
-        threshold=options.threshold,
-        seed_threshold=options.seed_threshold,
+        threshold=_THRESHOLD,
+        seed_threshold=_SEED_THRESHOLD,
         parameters=asdict(settled),
     )
 

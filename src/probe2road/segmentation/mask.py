@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,39 @@ from scipy.sparse.csgraph import connected_components
 
 from probe2road.errors import OptionError
 from probe2road.raster.grid import sparse_zeros
+from probe2road.segmentation.segmenter import Segmenter
 
-__all__ = ["threshold_mask"]
+__all__ = ["MaskOptions", "threshold_mask"]
 
 _STRIP = 1024  # rows looked at together
+
+
+@dataclass(frozen=True)
+class MaskOptions:
+    """Which probability makes a road; where a threshold is None, the segmenter's own."""
+
+    threshold: float | None = None  # probability that continues a road
+    seed_threshold: float | None = None  # probability that starts one
+
+    def __post_init__(self) -> None:
+        """Refuse what is no probability."""
+        for name in ("threshold", "seed_threshold"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < 1:
+                fix = "use a number between 0 and 1"
+                raise OptionError(f"{name} is {value}", where="MaskOptions", fix=fix)
+        if self.threshold is not None and self.seed_threshold is not None and self.threshold > self.seed_threshold:
+            fault = f"threshold {self.threshold} and seed_threshold {self.seed_threshold} are not in order"
+            raise OptionError(fault, where="MaskOptions", fix="use threshold <= seed_threshold")
+
+    def of(self, segmenter: Segmenter) -> tuple[float, float]:
+        """Return threshold and seed threshold for what a segmenter predicts.
+
+        A threshold that is given raises the segmenter's own seed threshold at least to itself.
+        """
+        threshold = segmenter.threshold if self.threshold is None else self.threshold
+        seed_threshold = self.seed_threshold
+        return threshold, max(segmenter.seed_threshold, threshold) if seed_threshold is None else seed_threshold
 
 
 def threshold_mask(

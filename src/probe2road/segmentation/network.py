@@ -16,7 +16,7 @@ from probe2road.raster.counts import CHANNELS
 from probe2road.raster.grid import Grid
 from probe2road.segmentation.runtime import DEVICES, load_network, run_network
 from probe2road.segmentation.segmenter import Segmenter
-from probe2road.segmentation.weights import ModelInfo, Weights, network_input, read_weights
+from probe2road.segmentation.weights import Weights, network_input, read_weights
 
 __all__ = ["NetworkOptions", "find_weights", "network_segmenter", "shipped_weights"]
 
@@ -37,8 +37,6 @@ class NetworkOptions:
     threads: int | None = None  # at most; all cores where None
     tile: int | None = None  # px, side of the tiles that the network sees; the model's own where None
     overlap: float = 0.5  # of neighbouring tiles, as a part of their side
-    threshold: float | None = None  # probability that continues a road; the model's own where None
-    seed_threshold: float | None = None  # probability that starts one; the model's own where None
     turns: int = 1  # right angles that every tile is turned by, up to 4; the mean of what the network says is taken
 
     def __post_init__(self) -> None:
@@ -115,8 +113,8 @@ def network_segmenter(weights: Weights, grid: Grid, options: NetworkOptions | No
     Raises
     ------
     OptionError
-        If the grid has another resolution than the network was trained at, the tile does not suit the network, the
-        thresholds are not in order, or the device is absent.
+        If the grid has another resolution than the network was trained at, the tile does not suit the network, or
+        the device is absent.
     InputError
         If the network cannot be run.
 
@@ -125,7 +123,7 @@ def network_segmenter(weights: Weights, grid: Grid, options: NetworkOptions | No
     Paper, section III-B. Tiles overlap as METHOD 0.1 row 13 says; see `probe2road.segmentation.tiling`.
     """
     options = options or NetworkOptions()
-    info = _overridden(weights.info, options)
+    info = replace(weights.info, tile=options.tile or weights.info.tile)
     if not np.isclose(grid.resolution, info.resolution):
         raise OptionError(
             f"the network sees pixels of {info.resolution} m, the raster has {grid.resolution} m",
@@ -157,13 +155,3 @@ def network_segmenter(weights: Weights, grid: Grid, options: NetworkOptions | No
         seed_threshold=info.seed_threshold,
         parameters={"model": info.name, "digest": weights.digest, **asdict(options)},
     )
-
-
-def _overridden(info: ModelInfo, options: NetworkOptions) -> ModelInfo:
-    """Return what the network promises, with the tile and the thresholds of the options where they have some."""
-    tile = options.tile or info.tile
-    threshold = info.threshold if options.threshold is None else options.threshold
-    seed_threshold = options.seed_threshold
-    if seed_threshold is None:
-        seed_threshold = max(info.seed_threshold, threshold)
-    return replace(info, tile=tile, threshold=threshold, seed_threshold=seed_threshold)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe2road.errors import OptionError, needs_extra
-from probe2road.recipe import Progress
+from probe2road.run.progress import Progress
 from probe2road.segmentation.losses import loss_function
 from probe2road.segmentation.weights import network_input
 from probe2road.training.config import TrainConfig

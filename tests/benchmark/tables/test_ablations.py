@@ -76,7 +76,7 @@ def test_the_command_writes_a_page_cells_and_figures(sets, work, tmp_path, monke
 
 def test_a_variant_takes_the_probability_and_scores_like_the_base_with_its_options(source, monkeypatch):
     base = score_cells(source, BASE)[-1]
-    monkeypatch.setattr("probe2road.recipe.predict_window", None)
+    monkeypatch.setattr("probe2road.segmentation.probability.predict_window", None)
     own = read_weights(BASE.weights).info.threshold
     same = replace(vary("threshold-0.2", {"network": {"threshold": own, "seed_threshold": own}}), name="ablations/same")
     build_cell(source, same, like=BASE)

@@ -26,6 +26,7 @@ from probe2road.matching.models import PublishedModel
 from probe2road.raster.counts import fleet_grid
 from probe2road.raster.grid import Grid
 from probe2road.run.progress import Progress, silent
+from probe2road.run.stages import COLLAPSED, PRUNED, ROADS, SKELETON, VECTORIZED
 from probe2road.run.workspace import Workspace, open_workspace
 
 __all__ = ["FLEET", "SIGMAS", "BiagioniOptions", "build_biagioni"]
@@ -117,27 +118,30 @@ def build_biagioni(
     """
     options, report = options or BiagioniOptions(), progress or silent
     grid = fleet_grid(fleet, resolution=options.resolution)
-    work = open_workspace(workspace, fleet, options)
-    if (kept := work.read_graph("5-roads")) is not None:
-        return kept
+    with open_workspace(workspace, fleet, options) as work:
+        if (kept := work.read_graph(ROADS)) is not None:
+            return kept
+        return work.finish(ROADS, _built(fleet, grid, options, work, report))
 
+
+def _built(fleet: Fleet, grid: Grid, options: BiagioniOptions, work: Workspace, report: Progress) -> RoadGraph:
+    """Build the map of a fleet: initial map, pruned, collapsed, pruned."""
     skeleton = _skeleton(fleet, grid, options, work, report)
     graph = initial_map(skeleton, grid, tolerance=options.simplify_tolerance)
-    work.write_graph("2-initial", graph)
+    work.write_graph(VECTORIZED, graph)
     observations = observe_trips(fleet, step=options.matcher.step, gaps=options.gaps)
     report("matching", 0, 2)
     runs = _match(observations, graph, graph.edges["score"].to_numpy(), options)
     graph, runs = prune_segments(graph, runs, min_runs=options.min_runs)
-    work.write_graph("3-pruned", graph)
+    work.write_graph(PRUNED, graph)
     report("matching", 1, 2)
     graph = collapse_segments(graph, runs, max_length=options.collapse_length, max_error=options.collapse_error)
-    work.write_graph("4-collapsed", graph)
+    work.write_graph(COLLAPSED, graph)
     # Members of a joined segment can have been driven in opposite directions only: its least numbers are then 0.
     weight = np.maximum(graph.edges["support"].to_numpy(np.float64), 1.0)
     runs = _match(observations, graph, weight, options)
     graph, _ = prune_segments(graph, runs, min_runs=options.min_runs)
     report("matching", 2, 2)
-    work.write_graph("5-roads", graph)
     return graph
 
 
@@ -145,7 +149,7 @@ def _skeleton(
     fleet: Fleet, grid: Grid, options: BiagioniOptions, work: Workspace, report: Progress
 ) -> NDArray[np.uint8]:
     """Thin the density of all trips."""
-    if (kept := work.read_raster("1-skeleton", grid)) is not None:
+    if (kept := work.read_raster(SKELETON, grid)) is not None:
         return kept
     report("density", 0, 1)
     sigma, cut = (length / options.resolution for length in SIGMAS[options.sigma])
@@ -153,7 +157,7 @@ def _skeleton(
     ranks = level_ranks(fleet, grid, blur_kernel(sigma, round(cut)), closing=closing, gaps=options.gaps)
     report("skeleton", 0, 1)
     skeleton = gray_skeleton(ranks)
-    work.write_raster("1-skeleton", skeleton, grid)
+    work.write_raster(SKELETON, skeleton, grid)
     return skeleton
 
 

@@ -23,6 +23,7 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster.counts import fleet_grid
 from probe2road.raster.grid import Grid
 from probe2road.run.progress import Progress, silent
+from probe2road.run.stages import LINKED, MASK, PROBABILITY, ROADS, VECTORIZED
 from probe2road.run.workspace import Workspace, open_workspace
 from probe2road.segmentation.mask import threshold_mask
 
@@ -101,23 +102,27 @@ def build_deepmg(
     Ruan et al., "Learning to Generate Maps from Trajectories", AAAI 2020; METHOD 3.
     """
     options, report = options or DeepMGOptions(), progress or silent
-    work = open_workspace(workspace, fleet, _Run(options, _digest(options.weights)))
-    if (graph := work.read_graph("7-roads")) is not None:
-        return graph
+    with open_workspace(workspace, fleet, _Run(options, _digest(options.weights))) as work:
+        if (kept := work.read_graph(ROADS)) is not None:
+            return kept
+        return work.finish(ROADS, _built(fleet, options, work, report))
+
+
+def _built(fleet: Fleet, options: DeepMGOptions, work: Workspace, report: Progress) -> RoadGraph:
+    """Build the graph of a fleet: mask, links, what traces confirm."""
     variant = find_variant(options.variant)
     probability, grid, steps = _segment(fleet, options, work, report)
     mask = threshold_mask(probability, threshold=options.threshold)
-    work.write_raster("2-mask", mask, grid)
+    work.write_raster(MASK, mask, grid)
     report("graph", 0, 1)
     graph = mask_graph(mask, grid, variant)
-    work.write_graph("4-vectorized", graph)
+    work.write_graph(VECTORIZED, graph)
     report("graph", 1, 1)
     graph = add_links(graph, variant, options.links)
-    work.write_graph("6-linked", graph)
+    work.write_graph(LINKED, graph)
     report("matching", 0, 1)
     traversals = count_traversals(steps, graph, options.matcher, min_path=variant.min_path)
     graph = prune_graph(graph, traversals, options.prune)
-    work.write_graph("7-roads", graph)
     report("matching", 1, 1)
     return graph
 
@@ -134,14 +139,14 @@ def _segment(
         raise OptionError(fault, where=options.weights, fix="name the variant that they were trained for")
     steps = thin_traces(fleet, trained.features, gaps=options.gaps)
     grid = fleet_grid(fleet, resolution=trained.features.resolution)
-    if (kept := work.read_raster("1-probability", grid)) is not None:
+    if (kept := work.read_raster(PROBABILITY, grid)) is not None:
         return kept, grid, steps
     probability = np.zeros(grid.shape, np.float32)
     for window, part in predict_windows(trained, steps, grid):
         report("segmentation", window.row, grid.rows)
         probability[window.core] = part
     report("segmentation", grid.rows, grid.rows)
-    work.write_raster("1-probability", probability, grid)
+    work.write_raster(PROBABILITY, probability, grid)
     return probability, grid, steps
 
 

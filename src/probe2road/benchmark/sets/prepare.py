@@ -20,7 +20,7 @@ from probe2road.benchmark.sets.residual import ResidualModel
 from probe2road.benchmark.sets.tiles import motorway_tiles, split_tiles
 from probe2road.errors import InputError
 from probe2road.io.atomic import atomic_path, make_folder
-from probe2road.recipe import Progress
+from probe2road.run.progress import Progress
 from probe2road.simulation.networks.network import RoadNetwork
 
 __all__ = ["check_dataset", "prepare", "prepare_dataset", "read_tiles"]

@@ -29,7 +29,7 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path, make_folder
 from probe2road.io.fleet_writer import ROW_GROUP, bounding_box, point_table, with_geo
 from probe2road.io.graph_files import write_graph
-from probe2road.recipe import Progress
+from probe2road.run.progress import Progress
 from probe2road.simulation.fleet_simulation import FleetChunk, simulate_chunks
 from probe2road.simulation.networks.network import RoadNetwork
 from probe2road.simulation.presets import Preset, find_preset

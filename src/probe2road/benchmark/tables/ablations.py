@@ -111,7 +111,7 @@ def vary(name: str, table: Table) -> Method:
     >>> vary("collapse-15", {"clean": {"short_edge": 15}}) is BASE
     True
     """
-    options = options_from_table({"segmenter": "network", **table}, BuildOptions, where=name)
+    options = options_from_table(dict(table), BuildOptions, where=name)
     if options == BASE.options:
         return BASE
     return _graph_only(replace(BASE, name=f"ablations/{name}", label=f"{BASE.label}, {name}", options=options))
@@ -126,7 +126,7 @@ def _threshold(source: Source) -> Ablation:
     """Vary how probable a pixel of the mask must be; the default is the network's own."""
     own = read_weights(shipped_weights(points=BASE.points)).info.threshold
     tables = {
-        f"{value:g}": {} if value == own else {"network": {"threshold": value, "seed_threshold": value}}
+        f"{value:g}": {} if value == own else {"mask": {"threshold": value, "seed_threshold": value}}
         for value in sorted({*_THRESHOLDS, own})
     }
     return _of_options("threshold", "Mask threshold", "probability", tables, source)

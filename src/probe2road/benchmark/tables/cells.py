@@ -37,7 +37,8 @@ from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.metrics.evaluate import evaluate
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.raster.grid import read_raster
-from probe2road.run.workspace import copy_first_stage
+from probe2road.run.stages import MASK, SKELETON
+from probe2road.run.workspace import copy_segmentation
 
 __all__ = ["FULL", "STAGES", "Cell", "build_cell", "read_built", "score_cells", "score_graph", "write_cells"]
 
@@ -91,7 +92,7 @@ def build_cell(source: Source, method: Method, *, like: Method | None = None) ->
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     if like is not None:
-        copy_first_stage(build_cell(source, like) / STAGES, folder / STAGES)
+        copy_segmentation(build_cell(source, like) / STAGES, folder / STAGES)
     resumed = (folder / STAGES).exists()  # then the seconds are not those of a whole build
     logger.info("building %s with %s", source.place.name, method.label)
     made = measure(_build, method, source.fleet_file, folder)
@@ -184,7 +185,7 @@ def _build(method: Method, path: Path, folder: Path) -> float:
     """Read, build and write; returns the seconds that the build took."""
     fleet = read_fleet(path, points_path(path) if method.points else None)
     started = time.perf_counter()
-    graph = method.builder(fleet, method.options, workspace=folder / STAGES)
+    graph = method.builder(fleet, options=method.options, workspace=folder / STAGES)
     seconds = time.perf_counter() - started
     write_graph(graph, folder / _GRAPH)
     return seconds
@@ -192,12 +193,12 @@ def _build(method: Method, path: Path, folder: Path) -> float:
 
 def _score(source: Source, method: Method, folder: Path, stage: str, area: str) -> dict[str, Any]:
     """Score one graph, and its mask, in one area, for a file."""
-    path = folder / _GRAPH if stage == FULL else folder / STAGES / f"{method.stages[stage]}.gpkg"
+    path = folder / _GRAPH if stage == FULL else folder / STAGES / method.stages[stage].file()
     extent = source.areas[area]
     tiles, figures = score_graph(read_graph(path), source.reference, area=extent)
     if method.mask and stage == FULL:
-        for name, raster, width in (("soft_f1", "2-mask", _LABEL_WIDTH), ("soft_f1_thinned", "3-skeleton", 1)):
-            mask, grid = read_raster(folder / STAGES / f"{raster}.tif")
+        for name, raster, width in (("soft_f1", MASK, _LABEL_WIDTH), ("soft_f1_thinned", SKELETON, 1)):
+            mask, grid = read_raster(folder / STAGES / raster.file())
             tiles[name] = soft_counts(mask[0], grid, source.reference, width=width, area=extent)
     return {"tiles": {name: _rows(table) for name, table in tiles.items()}, "figures": figures}
 

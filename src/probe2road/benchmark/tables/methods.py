@@ -13,7 +13,9 @@ from probe2road.baselines.kde import KdeOptions, build_kde
 from probe2road.errors import OptionError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.recipe import BuildOptions, build
+from probe2road.run.stages import CLEANED, GAPS_FILLED, Stage
 from probe2road.segmentation.network import shipped_weights
+from probe2road.segmentation.options import SegmentationOptions
 
 __all__ = ["METHODS", "Method", "find_methods"]
 
@@ -28,31 +30,31 @@ class Method:
     options: Any  # of the builder, a frozen dataclass
     points: bool = False  # whether it gets to see the semantic points, or traces alone
     mask: bool = False  # whether its workspace holds a mask that soft F1 can score
-    stages: Mapping[str, str] = field(
-        default_factory=dict
-    )  # further graphs of its workspace that are scored: label, file
+    stages: Mapping[str, Stage] = field(default_factory=dict)  # graphs of its workspace that are scored, too
 
     @property
     def weights(self) -> Path | None:
         """File of the network that the method runs, if it runs one."""
         if isinstance(self.options, DeepMGOptions):
             return Path(self.options.weights)
-        if isinstance(self.options, BuildOptions) and self.options.segmenter == "network":
-            return Path(self.options.network.weights or shipped_weights(points=self.points))
+        if isinstance(self.options, BuildOptions) and self.options.segmentation.segmenter == "network":
+            return Path(self.options.segmentation.network.weights or shipped_weights(points=self.points))
         return None
 
 
-_STAGES = {"no post-processing": "5-cleaned", "gap filling": "6-gaps-filled"}
+_NETWORK = BuildOptions(segmentation=SegmentationOptions(segmenter="network"))
+_DENSITY = BuildOptions(segmentation=SegmentationOptions(segmenter="density"))
+_STAGES = {"no post-processing": CLEANED, "gap filling": GAPS_FILLED}
 
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
         Method(
-            "probe2road", "Probe2Road, GNSS and vision", build, BuildOptions(segmenter="network"),
+            "probe2road", "Probe2Road, GNSS and vision", build, _NETWORK,
             points=True, mask=True, stages=_STAGES,
         ),
-        Method("probe2road-gnss", "Probe2Road, GNSS only", build, BuildOptions(segmenter="network"), mask=True),
-        Method("density", "Probe2Road, density segmenter", build, BuildOptions(segmenter="density"), mask=True),
+        Method("probe2road-gnss", "Probe2Road, GNSS only", build, _NETWORK, mask=True),
+        Method("density", "Probe2Road, density segmenter", build, _DENSITY, mask=True),
         Method("kde", "KDE in three dimensions", build_kde, KdeOptions()),
         Method("biagioni", "Biagioni and Eriksson", build_biagioni, FLEET),
         Method("deepmg", "DeepMG", build_deepmg, DeepMGOptions()),
