@@ -16,6 +16,7 @@ import pytest
 
 import probe2road
 
+DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "probe2road"
 MODULES = {
@@ -126,6 +127,21 @@ def test_import_loads_nothing_heavy() -> None:
     assert {"torch", "geopandas", "numba", "numpy", "pandas", "scipy", "matplotlib"}.isdisjoint(loaded)
 
 
+def test_the_library_names_no_flag_of_the_command_line() -> None:
+    programs = {"matching.osrm", "training.sources"}  # the flags of other programs, and whole commands to run first
+    flag = re.compile(r"(?<![\w-])--[a-z]")
+    for module in sorted(MODULES.keys() - programs):
+        if not module.startswith("cli."):
+            tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
+            documented = [
+                ast.get_docstring(node, clean=False) for node in ast.walk(tree) if isinstance(node, DOCUMENTED)
+            ]
+            texts = [
+                node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)
+            ]
+            assert [text for text in texts if flag.search(text) and text not in documented] == [], module
+
+
 def test_version_is_that_of_the_package() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert probe2road.__version__ == project["version"]
@@ -141,7 +157,7 @@ def test_readme_shows_two_commands() -> None:
 def test_every_module_is_in_the_reference() -> None:
     pages = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs" / "reference").glob("*.md"))
     listed = re.findall(r"^::: probe2road\.(\S+)$", pages, re.MULTILINE)
-    documented_by_hand = {"cli.main", "cli.benchmark"}
+    documented_by_hand = {"cli.main", "cli.benchmark", "cli.reading"}
     packages = {name for name, path in MODULES.items() if path.name == "__init__.py"}
     modules = sorted(set(MODULES) - packages - documented_by_hand)
     assert [name for name in modules if not any(f"{name}.".startswith(f"{entry}.") for entry in listed)] == []

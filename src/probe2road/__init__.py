@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from probe2road.io.describe import describe_fleet
     from probe2road.io.fleet_reader import read_fleet
     from probe2road.io.fleet_writer import write_fleet
+    from probe2road.io.formats import FleetFormat, GraphFormat
     from probe2road.io.graph_files import read_graph, write_graph
     from probe2road.io.graph_networkx import from_networkx, to_networkx
     from probe2road.matching.labels import label
@@ -36,6 +37,8 @@ _HOME = {
     "fleet_from_tables": "fleet.contract",
     "read_fleet": "io.fleet_reader",
     "write_fleet": "io.fleet_writer",
+    "FleetFormat": "io.formats",
+    "GraphFormat": "io.formats",
     "describe_fleet": "io.describe",
     "RoadGraph": "graph.roadgraph",
     "check_graph": "graph.check",
@@ -60,6 +63,8 @@ _HOME = {
 __all__ = [
     "BuildOptions",
     "Fleet",
+    "FleetFormat",
+    "GraphFormat",
     "MatchOptions",
     "Matches",
     "Probe2RoadError",

@@ -124,7 +124,7 @@ def require_metric(crs: CRS | None, *, where: object = None) -> CRS:
     probe2road.errors.CRSError: graph: coordinates are in degrees (WGS 84); reproject to a metric CRS and rerun
     """
     if crs is None:
-        raise CRSError("no CRS", where=where, fix="say which one it is, for example --crs EPSG:32616")
+        raise CRSError("no CRS", where=where, fix='say which one it is, for example crs="EPSG:32616"')
     if crs.is_geographic:
         raise CRSError(
             f"coordinates are in degrees ({crs.name})", where=where, fix="reproject to a metric CRS and rerun"

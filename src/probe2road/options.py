@@ -85,6 +85,9 @@ def changed_by(defaults: T, table: dict[str, Any], *, where: object = None) -> T
 
 def _converted(value: Any, hint: Any, where: str) -> Any:
     """Return the value as its field wants it: whole numbers become floats, lists become tuples, tables dataclasses."""
+    some = [kind for kind in get_args(hint) if kind is not type(None)]
+    if len(some) == 1 and get_origin(some[0]) is tuple and isinstance(value, list):  # a tuple or None
+        hint = some[0]
     if get_origin(hint) is tuple and isinstance(value, list):
         kinds = get_args(hint)
         if kinds[-1] is not Ellipsis and len(value) != len(kinds):

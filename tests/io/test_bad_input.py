@@ -116,7 +116,7 @@ def test_all_faults_of_a_table_and_of_several_files_are_told_at_once(tmp_path: P
 
 def test_crs_missing_mixed_or_contradictory(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(GOOD)
-    with pytest.raises(CRSError, match=r"a.csv: no CRS; say which one it is, for example --crs EPSG:32616"):
+    with pytest.raises(CRSError, match=r'a.csv: no CRS; say which one it is, for example crs="EPSG:32616"'):
         read_fleet(tmp_path / "a.csv")
     points = gpd.GeoDataFrame({"trip": [1]}, geometry=gpd.points_from_xy([446e3], [4636e3]), crs=UTM)
     points.to_parquet(tmp_path / "utm.parquet")

@@ -78,7 +78,9 @@ def test_what_cannot_be_told_is_asked(
 
 
 def test_points_need_ids_and_kinds() -> None:
-    with pytest.raises(InputError, match=r"no column for trace_id, kind .* --point-columns trace_id=NAME,kind=NAME"):
+    with pytest.raises(
+        InputError, match=r'no column for trace_id, kind .* point_columns={"trace_id": "NAME", "kind": "NAME"}'
+    ):
         choose_columns(["x", "y"], points=True)
     assert choose_columns(["trip", "x", "y", "class", "type"], points=True).columns["kind"] == "class"
 

@@ -204,7 +204,8 @@ def test_the_layer_is_named_where_there_are_several(tmp_path: Path) -> None:
     for layer in ("rivers", "streets"):
         pyogrio.write_dataframe(reference_lines(), tmp_path / "city.gpkg", layer=layer, append=layer == "streets")
     with pytest.raises(
-        InputError, match=r"has several layers, and none is called 'edges' \(there are: rivers, streets\)"
+        InputError,
+        match=r"has several layers, and none is called 'edges' \(there are: rivers, streets\); .* layer=.rivers",
     ):
         read_graph(tmp_path / "city.gpkg")
     with pytest.raises(InputError, match="has no layer 'roads'"):

@@ -113,7 +113,7 @@ def test_the_shipped_weights_suit_the_fleet(points, name, write_weights, monkeyp
 
 def test_an_installation_without_weights_says_so(monkeypatch, tmp_path):
     monkeypatch.setattr("importlib.resources.files", lambda package: tmp_path)
-    with pytest.raises(InputError, match=r"gnss\.onnx: this installation has no weights; .*--segmenter density"):
+    with pytest.raises(InputError, match=r'gnss\.onnx: this installation has no weights; .*segmenter="density"'):
         shipped_weights(points=False)
 
 
@@ -129,7 +129,7 @@ def test_weights_for_traces_serve_fleets_with_points(write_weights):
 
 
 def test_weights_that_look_at_an_unknown_channel_are_refused(fleet, write_weights):
-    with pytest.raises(InputError, match=r"weights\.onnx: no raster has the channels heading; use --segmenter density"):
+    with pytest.raises(InputError, match=r'weights\.onnx: no raster has the channels heading; use segmenter="density"'):
         build(fleet, options=options(write_weights(("traces", "heading"))))
 
 
@@ -141,7 +141,7 @@ def test_a_raster_with_too_few_channels_is_refused(fleet, write_weights):
 
 
 def test_another_resolution_is_refused(fleet, write_weights):
-    with pytest.raises(OptionError, match=r"pixels of 1\.0 m, the raster has 0\.5 m; use --resolution 1\.0"):
+    with pytest.raises(OptionError, match=r"pixels of 1\.0 m, the raster has 0\.5 m; use resolution=1\.0"):
         build(fleet, options=replace(options(write_weights(GNSS)), resolution=0.5))
 
 

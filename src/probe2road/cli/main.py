@@ -14,13 +14,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from probe2road.cli.benchmark import benchmark
+from probe2road.cli.reading import (
+    Said,
+    chosen_format,
+    fleet_options,
+    four_numbers,
+    graph_options,
+    read_roads,
+    reference_options,
+    spoken,
+    takes,
+)
 from probe2road.errors import OptionError, OutputError, Probe2RoadError
 from probe2road.run.progress import progress_bar
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe2road.fleet.contract import Fleet
+    from probe2road.io.formats import FleetFormat, GraphFormat
     from probe2road.segmentation.network import NetworkOptions
 
 __all__ = ["app", "main"]
@@ -38,16 +49,6 @@ app = typer.Typer(
 )
 
 app.add_typer(benchmark)
-
-# Options that several verbs share.
-Columns = Annotated[
-    str | None, typer.Option(help="Columns of the traces, ours=theirs: trace_id=trip,t=time,x=lon,y=lat,z=alt.")
-]
-PointColumns = Annotated[str | None, typer.Option(help="Columns of the semantic points, likewise; also kind=label.")]
-Crs = Annotated[str | None, typer.Option(help="CRS of the coordinates, for example EPSG:32616.")]
-Bbox = Annotated[str | None, typer.Option(help="Only this area: left,bottom,right,top in the CRS of the file.")]
-Delimiter = Annotated[str | None, typer.Option(help="Of text tables; told from the first line without it.")]
-NoHeader = Annotated[bool, typer.Option("--no-header", help="Text tables have no line of names: columns are 0, 1, 2.")]
 
 
 @app.callback()
@@ -67,29 +68,23 @@ def _common(
 
 
 @app.command()
+@takes(fleet_format=fleet_options)
 def build(
     traces: Annotated[list[Path], typer.Argument(help="Files or folders: Parquet, GeoParquet, CSV, GPX.")],
     output: Annotated[
         list[Path], typer.Option("--output", "-o", help="Graph to write; the suffix decides. May be repeated.")
     ],
+    *,
     points: Annotated[Path | None, typer.Option(help="Semantic points: a file or a folder.")] = None,
-    columns: Columns = None,
-    point_columns: PointColumns = None,
-    crs: Crs = None,
-    bbox: Bbox = None,
-    delimiter: Delimiter = None,
-    no_header: NoHeader = False,
+    fleet_format: Said[FleetFormat],
     segmenter: Annotated[str | None, typer.Option(help="network or density.")] = None,
     weights: Annotated[
         Path | None, typer.Option(help="Weights file of the network; the shipped one without it.")
     ] = None,
     device: Annotated[str | None, typer.Option(help="Device of the network: cpu or cuda.")] = None,
     resolution: Annotated[float | None, typer.Option(help="Metres per pixel.")] = None,
-    work_crs: Annotated[
-        str | None, typer.Option(help="Metric CRS to work in; chosen from the data without it.")
-    ] = None,
     refine: Annotated[bool, typer.Option(help="Let the traces fill gaps and split false junctions.")] = True,
-    config: Annotated[Path | None, typer.Option(help="TOML file with build options.")] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file with build options, and how to read.")] = None,
     keep_intermediate: Annotated[
         Path | None, typer.Option(help="Folder that keeps what every stage made, and a picture of it.")
     ] = None,
@@ -99,8 +94,9 @@ def build(
     An interrupted run goes on where it stopped when it is started again.
     """
     from probe2road.draw.stages import draw_stages
+    from probe2road.io.fleet_reader import read_fleet
     from probe2road.io.graph_files import graph_format, write_graph
-    from probe2road.options import load_options
+    from probe2road.options import options_from_table, read_toml
     from probe2road.recipe import BuildOptions
     from probe2road.recipe import build as build_graph
     from probe2road.run.workspace import resumable
@@ -109,14 +105,16 @@ def build(
         graph_format(path)
         if not path.parent.is_dir():
             raise OutputError(f"folder {path.parent} does not exist", where=path, fix="create it first")
-    options = load_options(config, BuildOptions) if config else BuildOptions()
+    table = read_toml(config) if config else {}
+    format = chosen_format(fleet_format, table, where=config)
+    options = options_from_table(table, BuildOptions, where=config)
     chosen: dict[str, Any] = {"segmenter": segmenter, "resolution": resolution}
     if weights or device:
         chosen |= _network_choice(options.segmentation.network, segmenter, weights, device)
     given = {name: value for name, value in chosen.items() if value is not None}
     options = replace(options, segmentation=replace(options.segmentation, **given), refine=options.refine and refine)
 
-    fleet = _read_fleet(traces, points, columns, point_columns, crs, bbox, delimiter, no_header, work_crs)
+    fleet = read_fleet(traces, points, format=format)
     keeping = nullcontext(keep_intermediate) if keep_intermediate else resumable(output[0])
     with keeping as workspace, progress_bar() as progress:
         graph = build_graph(fleet, options=options, workspace=workspace, progress=progress)
@@ -127,20 +125,17 @@ def build(
 
 
 @app.command()
+@takes(fleet_format=fleet_options)
 def align(
     traces: Annotated[list[Path], typer.Argument(help="Raw fleet data: files or folders.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file for the aligned traces.")],
+    *,
     points: Annotated[Path | None, typer.Option(help="Semantic points: a file or a folder.")] = None,
     add_to: Annotated[Path | None, typer.Option(help="Aligned fleet data that the drives are added to.")] = None,
     report: Annotated[Path | None, typer.Option(help="Folder for figures, lists and a picture.")] = None,
-    columns: Columns = None,
-    point_columns: PointColumns = None,
-    crs: Crs = None,
-    bbox: Bbox = None,
-    delimiter: Delimiter = None,
-    no_header: NoHeader = False,
+    fleet_format: Said[FleetFormat],
     drop_rejected: Annotated[bool, typer.Option("--drop-rejected", help="Leave out what cannot be aligned.")] = False,
-    config: Annotated[Path | None, typer.Option(help="TOML file with alignment options.")] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file with alignment options, and how to read.")] = None,
     workers: Annotated[int, typer.Option(help="Processes; no influence on the result.")] = 1,
 ) -> None:
     """Align the drives of a fleet: move poses and points to where they agree.
@@ -150,16 +145,18 @@ def align(
     from probe2road.alignment.align import AlignOptions, add_drives
     from probe2road.alignment.align import align as align_fleet
     from probe2road.alignment.report import draw_alignment, write_report
-    from probe2road.io.fleet_reader import read_fleet_files
+    from probe2road.io.fleet_reader import read_fleet, read_fleet_files
     from probe2road.io.fleet_writer import write_fleet
-    from probe2road.options import load_options
+    from probe2road.options import options_from_table, read_toml
     from probe2road.run.workspace import resumable
 
-    options = load_options(config, AlignOptions) if config else AlignOptions()
+    table = read_toml(config) if config else {}
+    format = chosen_format(fleet_format, table, where=config)
+    options = options_from_table(table, AlignOptions, where=config)
     options = replace(options, keep_rejected=False) if drop_rejected else options
     base = read_fleet_files(add_to) if add_to else None
-    work_crs = base.crs.to_wkt() if base else None
-    fleet = _read_fleet(traces, points, columns, point_columns, crs, bbox, delimiter, no_header, work_crs)
+    format = replace(format, target_crs=base.crs) if base else format
+    fleet = read_fleet(traces, points, format=format)
     with resumable(output) as workspace, progress_bar() as progress:
         kept: dict[str, Any] = {"workspace": workspace, "workers": workers, "progress": progress}
         result = (
@@ -173,31 +170,32 @@ def align(
 
 
 @app.command()
+@takes(fleet_format=fleet_options, graph_format=graph_options, without=["point_columns"])
 def match(
     traces: Annotated[Path, typer.Argument(help="Fleet data: a file or a folder.")],
     graph: Annotated[Path, typer.Argument(help="Road graph, in any format that build writes, or OSM.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file for the matches, a row for each fix.")],
+    *,
     steps: Annotated[Path | None, typer.Option(help="Parquet file for the paths, a row for each edge driven.")] = None,
     profile: Annotated[str | None, typer.Option(help="auto, fleet, sparse or published.")] = None,
-    columns: Columns = None,
-    crs: Crs = None,
-    bbox: Bbox = None,
-    delimiter: Delimiter = None,
-    no_header: NoHeader = False,
-    config: Annotated[Path | None, typer.Option(help="TOML file with matching options.")] = None,
+    fleet_format: Said[FleetFormat],
+    graph_format: Said[GraphFormat],
+    config: Annotated[Path | None, typer.Option(help="TOML file with matching options, and how to read.")] = None,
 ) -> None:
     """Match traces to the edges of a road graph."""
     from probe2road.io.atomic import atomic_path
-    from probe2road.io.graph_files import read_graph
+    from probe2road.io.fleet_reader import read_fleet
     from probe2road.matching.match import MatchOptions
     from probe2road.matching.match import match as match_fleet
-    from probe2road.options import load_options
+    from probe2road.options import options_from_table, read_toml
 
-    options = load_options(config, MatchOptions) if config else MatchOptions()
+    table = read_toml(config) if config else {}
+    format = chosen_format(fleet_format, table, where=config)
+    roads_format = chosen_format(graph_format, table, where=config)
+    options = options_from_table(table, MatchOptions, where=config)
     options = replace(options, profile=profile) if profile else options
-    roads = read_graph(graph)
-    work_crs = roads.crs.to_wkt()
-    fleet = _read_fleet([traces], None, columns, None, crs, bbox, delimiter, no_header, work_crs)
+    roads = read_roads(graph, graph_format, format=roads_format, target_crs=format.target_crs)
+    fleet = read_fleet(traces, format=format, target_crs=roads.crs)
     matches = match_fleet(roads, fleet, options=options)
     for path, table in ((output, matches.fixes), (steps, matches.steps)):
         if path is not None:
@@ -207,9 +205,13 @@ def match(
 
 
 @app.command()
+@takes(graph_format=graph_options, reference_format=reference_options)
 def evaluate(
     proposal: Annotated[Path, typer.Argument(help="Road graph to score.")],
     reference: Annotated[Path, typer.Argument(help="Road graph to score against.")],
+    *,
+    graph_format: Said[GraphFormat],
+    reference_format: Said[GraphFormat],
     metrics: Annotated[
         str | None, typer.Option(help="Comma-separated: geo, itopo, topo, apls, buffer_geo, ...")
     ] = None,
@@ -218,13 +220,13 @@ def evaluate(
 ) -> None:
     """Score a road graph against a reference; both may be in any format that build writes, or OSM."""
     from probe2road.io.atomic import atomic_path
-    from probe2road.io.graph_files import read_graph
     from probe2road.metrics import DEFAULT_METRICS
     from probe2road.metrics import evaluate as score
 
-    target = read_graph(reference)
+    target = read_roads(reference, reference_format)
     names = metrics.split(",") if metrics else DEFAULT_METRICS
-    scores = score(read_graph(proposal), target, metrics=names, area=_numbers(area, "--area") if area else None)
+    box = four_numbers(area, "--area") if area else None
+    scores = score(read_roads(proposal, graph_format), target, metrics=names, area=box)
     if output:
         with atomic_path(output) as temporary:
             scores.to_csv(temporary, index=False)
@@ -232,57 +234,46 @@ def evaluate(
 
 
 @app.command()
+@takes(fleet_format=fleet_options, graph_format=graph_options, without=["point_columns", "graph_crs"])
 def info(
     file: Annotated[Path, typer.Argument(help="Fleet data or a road graph.")],
-    columns: Columns = None,
-    crs: Crs = None,
-    bbox: Bbox = None,
-    delimiter: Delimiter = None,
-    no_header: NoHeader = False,
+    fleet_format: Said[FleetFormat],
+    graph_format: Said[GraphFormat],
 ) -> None:
     """Describe fleet data or a road graph in figures."""
     from probe2road.io.describe import describe_file
 
-    figures = describe_file(
-        file,
-        columns=_column_map(columns, "--columns"),
-        crs=crs,
-        bbox=_numbers(bbox, "--bbox") if bbox else None,
-        delimiter=delimiter,
-        header=not no_header,
-    )
-    typer.echo(json.dumps(figures, indent=1))
+    format = chosen_format(fleet_format)  # there is one file: its CRS is said in one way, whatever it holds
+    roads_format = replace(chosen_format(graph_format), crs=format.crs, target_crs=format.target_crs)
+    typer.echo(json.dumps(describe_file(file, format=format, graph_format=roads_format), indent=1))
 
 
 @app.command()
+@takes(fleet_format=fleet_options, graph_format=graph_options, reference_format=reference_options)
 def view(
     graph: Annotated[Path, typer.Argument(help="Road graph.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="HTML file, or PNG.")],
+    *,
     traces: Annotated[Path | None, typer.Option(help="Fleet data to show under it.")] = None,
     points: Annotated[Path | None, typer.Option(help="Semantic points to show under it.")] = None,
     reference: Annotated[Path | None, typer.Option(help="Road graph to compare with, in a PNG.")] = None,
     title: Annotated[str | None, typer.Option(help="Heading; the file's name without it.")] = None,
-    columns: Columns = None,
-    point_columns: PointColumns = None,
-    crs: Crs = None,
-    delimiter: Delimiter = None,
-    no_header: NoHeader = False,
+    fleet_format: Said[FleetFormat],
+    graph_format: Said[GraphFormat],
+    reference_format: Said[GraphFormat],
 ) -> None:
     """Draw a road graph over its traces: one HTML page that needs no network, or a picture."""
     from probe2road.draw.page import view
     from probe2road.draw.picture import draw_graph
-    from probe2road.io.graph_files import read_graph
+    from probe2road.io.fleet_reader import read_fleet
 
     if output.suffix.lower() not in (".html", ".htm", ".png"):
         raise OptionError(f"cannot draw {output.suffix or 'no suffix'}", where=output, fix="use .html or .png")
-    roads = read_graph(graph)
-    fleet = None
-    if traces:
-        fleet = _read_fleet(
-            [traces], points, columns, point_columns, crs, None, delimiter, no_header, roads.crs.to_wkt()
-        )
+    format = chosen_format(fleet_format)
+    roads = read_roads(graph, graph_format, target_crs=format.target_crs)
+    fleet = read_fleet(traces, points, format=format, target_crs=roads.crs) if traces else None
     if output.suffix.lower() == ".png":
-        draw_graph(roads, output, fleet=fleet, reference=read_graph(reference) if reference else None)
+        draw_graph(roads, output, fleet=fleet, reference=read_roads(reference, reference_format) if reference else None)
     else:
         view(roads, output, fleet=fleet, title=title or graph.name)
 
@@ -379,38 +370,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except Probe2RoadError as error:
         if logger.isEnabledFor(logging.DEBUG):
             raise
-        typer.secho(f"error: {error}", fg="red", err=True)
+        typer.secho(f"error: {spoken(str(error))}", fg="red", err=True)
         sys.exit(2)
     except KeyboardInterrupt:
         typer.secho("interrupted; start again to go on", err=True)
         sys.exit(130)
-
-
-def _read_fleet(
-    traces: list[Path],
-    points: Path | None,
-    columns: str | None,
-    point_columns: str | None,
-    crs: str | None,
-    bbox: str | None,
-    delimiter: str | None,
-    no_header: bool,
-    work_crs: str | None,
-) -> Fleet:
-    from probe2road.io.fleet_reader import read_fleet
-
-    box = _numbers(bbox, "--bbox") if bbox else None
-    return read_fleet(
-        traces[0] if len(traces) == 1 else traces,
-        points,
-        columns=_column_map(columns, "--columns"),
-        point_columns=_column_map(point_columns, "--point-columns"),
-        crs=crs,
-        target_crs=work_crs,
-        bbox=box,
-        delimiter=delimiter,
-        header=not no_header,
-    )
 
 
 def _network_choice(
@@ -422,25 +386,6 @@ def _network_choice(
         raise OptionError(f"segmenter {segmenter} runs no network", where=option, fix="use --segmenter network")
     file = str(weights) if weights else network.weights
     return {"segmenter": "network", "network": replace(network, weights=file, device=device or network.device)}
-
-
-def _column_map(text: str | None, option: str) -> dict[str, str]:
-    """Read ``ours=theirs,ours=theirs``."""
-    if not text:
-        return {}
-    pairs = [pair.partition("=") for pair in text.split(",")]
-    if bad := [name for name, equals, _ in pairs if not equals]:
-        raise OptionError(f"{bad[0]!r} has no =", where=option, fix="write ours=theirs, for example trace_id=trip")
-    return {name.strip(): theirs.strip() for name, _, theirs in pairs}
-
-
-def _numbers(text: str, option: str) -> tuple[float, float, float, float]:
-    """Read ``left,bottom,right,top``."""
-    try:
-        left, bottom, right, top = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise OptionError(f"{text!r} is not left,bottom,right,top", where=option) from error
-    return left, bottom, right, top
 
 
 def _print_scores(scores: pd.DataFrame) -> None:

@@ -319,7 +319,11 @@ def _degree_faults(lon: NDArray[np.float64], lat: NDArray[np.float64], origin: T
     bad_lon, bad_lat = np.abs(lon) > 180, np.abs(lat) > 90
     middle = float(np.median(np.abs(lat)))
     swapped = "; longitude and latitude look swapped" if middle > _POLAR and np.abs(lon).max() <= 90 else ""
-    projected = "; the values look projected: pass their --crs" if max(np.abs(lon).max(), middle) > 1000 else ""
+    projected = (
+        '; the values look projected: pass their CRS, for example crs="EPSG:32616"'
+        if max(np.abs(lon).max(), middle) > 1000
+        else ""
+    )
     faults = []
     for name, bad, limit, values in (("longitudes", bad_lon, 180, lon), ("latitudes", bad_lat, 90, lat)):
         if bad.any():
@@ -338,7 +342,7 @@ def _metre_faults(x: NDArray[np.float64], y: NDArray[np.float64], crs: CRS) -> l
     extent = f"x {x.min():.6g}..{x.max():.6g}, y {y.min():.6g}..{y.max():.6g}"
     spread = float(np.hypot(np.ptp(x), np.ptp(y)))
     if max(np.abs(x).max(), np.abs(y).max()) <= 180 and 0 < spread < _SPREAD_OF_DEGREES:
-        return [f"the coordinates look like degrees ({extent}) but the CRS is {crs.name}; pass --crs EPSG:4326 if so"]
+        return [f'the coordinates look like degrees ({extent}) but the CRS is {crs.name}; pass crs="EPSG:4326" if so']
     if _in_area_of_use(x, y, crs):
         return []
     swapped = "; x and y look swapped" if _in_area_of_use(y, x, crs) else "; check the CRS"

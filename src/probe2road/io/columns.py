@@ -6,9 +6,9 @@ reader; where two columns would do, the reader asks.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,6 +22,7 @@ from probe2road.fleet.tables import (
     TRACE_COLUMNS,
     TRACE_OPTIONAL_COLUMNS,
 )
+from probe2road.io.formats import ColumnMap
 
 __all__ = ["KIND_SYNONYMS", "USUAL_NAMES", "ColumnChoice", "choose_columns", "standard_kinds", "times_from_numbers"]
 
@@ -71,7 +72,7 @@ class ColumnChoice:
 
 def choose_columns(
     there: Sequence[str],
-    given: Mapping[str, Any] | None = None,
+    given: ColumnMap | None = None,
     *,
     points: bool = False,
     geometry: str | None = None,
@@ -117,32 +118,22 @@ def choose_columns(
     >>> choose_columns(["trip", "ts", "time", "x", "y"], where="drives.csv")
     Traceback (most recent call last):
         ...
-    probe2road.errors.InputError: drives.csv: column 't' could be ts, time; say which, for example --columns t=ts
+    probe2road.errors.InputError: drives.csv: column 't' could be ts, time; say which, for example columns={"t": "ts"}
     """
     ours = (*POINT_COLUMNS, *POINT_OPTIONAL_COLUMNS) if points else (*TRACE_COLUMNS, *TRACE_OPTIONAL_COLUMNS)
     there = list(dict.fromkeys(there))
     named = _given_columns(there, given or {}, (*ours, "geometry"), where)
     left_out = {name for name, theirs in named.items() if not theirs}
     chosen = {name: theirs for name, theirs in named.items() if theirs}
+    argument = "point_columns" if points else "columns"
     faults: list[str] = []
-    position, degrees = _position_columns(there, chosen, geometry, crs, faults)
-    in_geometry = {"x", "y", "z"} if "geometry" in position else set()
-    for name in ours:
-        if name in position:
-            chosen[name] = position[name]
-        elif name in USUAL_NAMES and name not in chosen and name not in left_out | in_geometry:
-            theirs = _usual(name, there, faults)
-            if theirs is not None and theirs not in chosen.values():
-                chosen[name] = theirs
+    position, degrees = _position_columns(there, chosen, geometry, crs, argument, faults)
     chosen |= position
+    in_geometry = {"x", "y", "z"} if "geometry" in position else set()
+    wanted = [name for name in ours if name not in left_out | in_geometry]
+    chosen |= _usual_columns(wanted, there, chosen, argument, faults)
     needed = {"x", "y", "trace_id", "kind"} if points else {"x", "y"}
-    missing = [name for name in ours if name in needed - in_geometry - set(chosen)]
-    if missing:
-        example = ",".join(f"{name}=NAME" for name in missing)
-        faults.append(
-            f"no column for {', '.join(missing)} (the columns are {', '.join(there)}); "
-            f"say which, for example --{'point-' if points else ''}columns {example}"
-        )
+    faults += _missing_faults([name for name in ours if name in needed - in_geometry - set(chosen)], there, argument)
     if faults:
         raise InputError.from_faults(faults, where=where)
     ordered = {name: chosen[name] for name in (*ours, "geometry") if name in chosen}
@@ -200,9 +191,7 @@ def times_from_numbers(values: pd.Series) -> tuple[pd.Series, str]:
     return pd.Series(nanoseconds.view("datetime64[ns]")).dt.tz_localize("UTC"), unit
 
 
-def _given_columns(
-    there: Sequence[str], given: Mapping[str, Any], ours: Sequence[str], where: object
-) -> dict[str, str]:
+def _given_columns(there: Sequence[str], given: ColumnMap, ours: Sequence[str], where: object) -> dict[str, str]:
     """Check the user's column map against our names and the file's."""
     unknown = [name for name in given if name not in ours]
     if unknown:
@@ -217,7 +206,12 @@ def _given_columns(
 
 
 def _position_columns(
-    there: Sequence[str], chosen: Mapping[str, str], geometry: str | None, crs: CRS | None, faults: list[str]
+    there: Sequence[str],
+    chosen: Mapping[str, str],
+    geometry: str | None,
+    crs: CRS | None,
+    argument: str,
+    faults: list[str],
 ) -> tuple[dict[str, str], bool]:
     """Find the coordinates: given ones, then the geometry column, then lon and lat, then x and y."""
     if "geometry" in chosen:
@@ -236,14 +230,27 @@ def _position_columns(
         }
         pair = {axis: columns[0] for axis, columns in found.items() if columns}
         if len(pair) == 2:
-            faults += [_ambiguous(axis, columns) for axis, columns in found.items() if len(columns) > 1]
+            faults += [_ambiguous(axis, columns, argument) for axis, columns in found.items() if len(columns) > 1]
             return pair, names is _LON_LAT
         partial = partial or pair
     geometries = _best([_GEOMETRY], there)
     return ({"geometry": geometries[0]} if len(geometries) == 1 else partial), False
 
 
-def _usual(name: str, there: Sequence[str], faults: list[str]) -> str | None:
+def _usual_columns(
+    wanted: Sequence[str], there: Sequence[str], taken: Mapping[str, str], argument: str, faults: list[str]
+) -> dict[str, str]:
+    """Find those of our columns that are not taken by their usual names; a column of the file serves once."""
+    found: dict[str, str] = {}
+    for name in wanted:
+        if name in USUAL_NAMES and name not in taken:
+            theirs = _usual(name, there, argument, faults)
+            if theirs is not None and theirs not in {*taken.values(), *found.values()}:
+                found[name] = theirs
+    return found
+
+
+def _usual(name: str, there: Sequence[str], argument: str, faults: list[str]) -> str | None:
     """Find the one column with a usual name of ours, or say that there are several."""
     if name in there:
         return name
@@ -251,8 +258,17 @@ def _usual(name: str, there: Sequence[str], faults: list[str]) -> str | None:
     split = names.index(None) if None in names else len(names)
     found = _best([names[:split], names[split + 1 :]], there)
     if len(found) > 1:
-        faults.append(_ambiguous(name, found))
+        faults.append(_ambiguous(name, found, argument))
     return found[0] if found else None
+
+
+def _missing_faults(missing: Collection[str], there: Sequence[str], argument: str) -> list[str]:
+    """Name the columns that are needed and were neither given nor found; no fault where none is missing."""
+    if not missing:
+        return []
+    example = f"{argument}={json.dumps(dict.fromkeys(missing, 'NAME'))}"
+    names = f"no column for {', '.join(missing)} (the columns are {', '.join(there)})"
+    return [f"{names}; say which, for example {example}"]
 
 
 def _best(tiers: Sequence[Sequence[str | None]], there: Sequence[str]) -> list[str]:
@@ -264,8 +280,9 @@ def _best(tiers: Sequence[Sequence[str | None]], there: Sequence[str]) -> list[s
     return []
 
 
-def _ambiguous(name: str, found: Sequence[str]) -> str:
-    return f"column {name!r} could be {', '.join(found)}; say which, for example --columns {name}={found[0]}"
+def _ambiguous(name: str, found: Sequence[str], argument: str) -> str:
+    example = f"{argument}={json.dumps({name: found[0]}, ensure_ascii=False)}"
+    return f"column {name!r} could be {', '.join(found)}; say which, for example {example}"
 
 
 def _plain(name: str) -> str:

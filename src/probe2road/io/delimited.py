@@ -6,18 +6,17 @@ import csv
 import gzip
 import re
 import zlib
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
-from pyproj import CRS
 
 from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin
-from probe2road.io.columns import choose_columns, standard_kinds, times_from_numbers
+from probe2road.io.columns import ColumnChoice, choose_columns, standard_kinds, times_from_numbers
+from probe2road.io.formats import FleetFormat
 from probe2road.io.sources import RawTable, SourceFile
 
 __all__ = ["read_text_table"]
@@ -29,23 +28,27 @@ _PLAIN_INTEGER = re.compile(r"0|-?[1-9]\d{0,17}")
 _EXAMPLES_SHOWN = 3
 
 
-def read_text_table(
-    source: SourceFile,
-    *,
-    columns: Mapping[str, Any] | None = None,
-    points: bool = False,
-    crs: CRS | None = None,
-    delimiter: str | None = None,
-    header: bool = True,
-) -> RawTable:
+class _Head(NamedTuple):
+    """The top of a text file."""
+
+    line: str  # the first that is not blank
+    n_blank: int  # lines above it
+    is_all: bool  # nothing follows
+
+
+def read_text_table(source: SourceFile, format: FleetFormat | None = None, *, points: bool = False) -> RawTable:
     """Read one text table in UTF-8.
 
     Trace ids stay text unless every one is a plain integer: ``007`` and ``7`` are two traces.
 
     Parameters
     ----------
-    source, columns, points, crs, delimiter, header
-        As for `probe2road.read_fleet`.
+    source
+        The file.
+    format
+        What the user says of the columns, the CRS, the delimiter and the header; nothing where it is None.
+    points
+        Whether the file holds semantic points rather than traces.
 
     Returns
     -------
@@ -58,37 +61,22 @@ def read_text_table(
         If the file is binary, not UTF-8 or a broken gzip, if rows differ in length, or if its columns cannot
         be told.
     """
-    first_line, n_blank, is_all = _first_line(source)
-    if header and is_all:
-        raise InputError("no rows below the header", where=source.path, fix="check the export")
-    delimiter = delimiter or max(_DELIMITERS, key=first_line.count)
-    cells = [cell.strip() for cell in next(csv.reader([first_line], delimiter=delimiter))]
-    if header and all(map(_is_number, cells)):
-        fix = "say that there is no header; the columns are then called 0, 1, 2"
-        raise InputError(f"the first line holds numbers ({first_line[:60]}), not names", where=source.path, fix=fix)
-    names = cells if header else [str(number) for number in range(len(cells))]
-    choice = choose_columns(names, columns, points=points, crs=crs, where=source.path)
-    wanted = list(dict.fromkeys(choice.columns.values()))
-    repeated = [name for name in wanted if names.count(name) > 1]
-    if repeated:
-        raise InputError(f"several columns are called {', '.join(repeated)}", where=source.path, fix="rename them")
-    types = {choice.columns[name]: _WORDS for name in ("trace_id", "vehicle_id", "kind") if name in choice.columns}
-    skip = n_blank + header
-    content = _parse(source, names, wanted, types, delimiter, skip)
-    table, unit = {}, ""
-    for name, theirs in choice.columns.items():
-        values = _identifiers(content.column(theirs)) if name.endswith("_id") else content.column(theirs).to_pandas()
-        if name == "t":
-            values, unit = times_from_numbers(values)
-        table[name] = standard_kinds(values) if name == "kind" else values
+    format = format or FleetFormat()
+    head = _read_head(source)
+    delimiter = format.delimiter or max(_DELIMITERS, key=head.line.count)
+    names = _column_names(head, delimiter, source, header=format.header)
+    choice = choose_columns(
+        names, format.columns_of(points=points), points=points, crs=format.stated_crs, where=source.path
+    )
+    skip = head.n_blank + format.header
+    table, unit = _our_columns(_parse(source, names, choice, delimiter, skip), choice)
     guessed = tuple(f"{name}={choice.columns[name]}" for name in choice.guessed)
     origin = TableOrigin("points" if points else "traces", "line", skip + 1, choice.columns)
-    read = pd.DataFrame(table, copy=False)
-    return RawTable(read, None, choice.degrees, origin, (*guessed, *([f"t in {unit}"] if unit else [])))
+    return RawTable(table, None, choice.degrees, origin, (*guessed, *([f"t in {unit}"] if unit else [])))
 
 
-def _first_line(source: SourceFile) -> tuple[str, int, bool]:
-    """Return the first line of a text file, the number of blank ones above, and whether nothing follows."""
+def _read_head(source: SourceFile) -> _Head:
+    """Read the top of a text file."""
     try:
         with gzip.open(source.path) if source.path.suffix.lower() == ".gz" else source.path.open("rb") as file:
             head = file.read(_HEAD)
@@ -106,13 +94,35 @@ def _first_line(source: SourceFile) -> tuple[str, int, bool]:
         first = lines[n_blank].decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"the first line is not UTF-8 ({error})", where=source.path, fix="save it as UTF-8") from error
-    return first, n_blank, len(head) < _HEAD and not any(line.strip() for line in lines[n_blank + 1 :])
+    return _Head(first, n_blank, len(head) < _HEAD and not any(line.strip() for line in lines[n_blank + 1 :]))
 
 
-def _parse(
-    source: SourceFile, names: list[str], wanted: list[str], types: Mapping[str, Any], delimiter: str, skip: int
-) -> pa.Table:
-    """Parse the wanted columns, and report every row that is too short or too long."""
+def _column_names(head: _Head, delimiter: str, source: SourceFile, *, header: bool) -> list[str]:
+    """Return the names in the header, or the numbers 0, 1, 2 where there is none."""
+    if header and head.is_all:
+        raise InputError("no rows below the header", where=source.path, fix="check the export")
+    cells = [cell.strip() for cell in next(csv.reader([head.line], delimiter=delimiter))]
+    if not header:
+        return [str(number) for number in range(len(cells))]
+    if all(map(_is_number, cells)):
+        fix = "say that there is no header (header=False); the columns are then called 0, 1, 2"
+        raise InputError(f"the first line holds numbers ({head.line[:60]}), not names", where=source.path, fix=fix)
+    return cells
+
+
+def _distinct_columns(names: list[str], choice: ColumnChoice, source: SourceFile) -> list[str]:
+    """Return the file's names of the chosen columns, each once; refuse a name that several columns have."""
+    wanted = list(dict.fromkeys(choice.columns.values()))
+    repeated = [name for name in wanted if names.count(name) > 1]
+    if repeated:
+        raise InputError(f"several columns are called {', '.join(repeated)}", where=source.path, fix="rename them")
+    return wanted
+
+
+def _parse(source: SourceFile, names: list[str], choice: ColumnChoice, delimiter: str, skip: int) -> pa.Table:
+    """Parse the chosen columns, and report every row that is too short or too long."""
+    wanted = _distinct_columns(names, choice, source)
+    types = {choice.columns[name]: _WORDS for name in ("trace_id", "vehicle_id", "kind") if name in choice.columns}
     ragged: list[Any] = []
 
     def note(row: Any) -> str:
@@ -143,6 +153,17 @@ def _parse(
     if binary:
         raise InputError(f"column {', '.join(binary)} is not UTF-8", where=source.path, fix="save it as UTF-8")
     return content
+
+
+def _our_columns(content: pa.Table, choice: ColumnChoice) -> tuple[pd.DataFrame, str]:
+    """Rename the columns to ours and read numeric times; and the unit of those times."""
+    table, unit = {}, ""
+    for name, theirs in choice.columns.items():
+        values = _identifiers(content.column(theirs)) if name.endswith("_id") else content.column(theirs).to_pandas()
+        if name == "t":
+            values, unit = times_from_numbers(values)
+        table[name] = standard_kinds(values) if name == "kind" else values
+    return pd.DataFrame(table, copy=False), unit
 
 
 def _identifiers(column: pa.ChunkedArray) -> pd.Series:

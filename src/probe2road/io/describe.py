@@ -15,20 +15,25 @@ from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
 from probe2road.fleet.tables import POINT_KINDS
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet
+from probe2road.io.formats import FleetFormat, GraphFormat
 from probe2road.io.graph_files import READABLE, read_graph
 
 __all__ = ["describe_file", "describe_fleet", "describe_graph"]
 
 
-def describe_file(path: str | Path, **read_options: Any) -> dict[str, Any]:
+def describe_file(
+    path: str | Path, *, format: FleetFormat | None = None, graph_format: GraphFormat | None = None
+) -> dict[str, Any]:
     """Describe a file of fleet data or a road graph.
 
     Parameters
     ----------
     path
         File or folder.
-    **read_options
-        Arguments of `probe2road.read_fleet`, for fleet data.
+    format
+        What the user says of the file, for fleet data.
+    graph_format
+        Likewise, for a road graph.
 
     Returns
     -------
@@ -42,8 +47,8 @@ def describe_file(path: str | Path, **read_options: Any) -> dict[str, Any]:
         If the file cannot be read as either.
     """
     if _holds_graph(Path(path)):
-        return {"content": "road graph", **describe_graph(read_graph(path))}
-    return {"content": "fleet data", **describe_fleet(path, **read_options)}
+        return {"content": "road graph", **describe_graph(read_graph(path, format=graph_format))}
+    return {"content": "fleet data", **describe_fleet(path, format=format)}
 
 
 def describe_graph(graph: RoadGraph) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
@@ -12,14 +11,15 @@ import numpy as np
 import pandas as pd
 from pyproj import CRS
 
-from probe2road.crs import WGS84, parse_crs, same_crs
-from probe2road.errors import CRSError, InputError, OptionError
+from probe2road.crs import WGS84, same_crs
+from probe2road.errors import CRSError, InputError
 from probe2road.fleet.contract import Fleet, fleet_from_checked
 from probe2road.fleet.tables import check_points, check_traces
 from probe2road.io.delimited import read_text_table
 from probe2road.io.fleet_writer import points_path
+from probe2road.io.formats import BBox, ColumnMap, FleetFormat, adjusted
 from probe2road.io.gpx import read_gpx
-from probe2road.io.parquet import BBox, inside, read_parquet
+from probe2road.io.parquet import inside, read_parquet
 from probe2road.io.sources import RawTable, SourceFile, find_sources
 
 __all__ = ["read_fleet", "read_fleet_files"]
@@ -35,13 +35,14 @@ def read_fleet(
     traces: Source,
     points: Source | None = None,
     *,
-    columns: Mapping[str, Any] | None = None,
-    point_columns: Mapping[str, Any] | None = None,
+    format: FleetFormat | None = None,
+    columns: ColumnMap | None = None,
+    point_columns: ColumnMap | None = None,
     crs: Any = None,
     target_crs: Any = None,
     bbox: BBox | None = None,
     delimiter: str | None = None,
-    header: bool = True,
+    header: bool | None = None,
 ) -> Fleet:
     r"""Read traces, and semantic points where there are any, and check everything.
 
@@ -59,6 +60,9 @@ def read_fleet(
         timestamps, or numbers since 1970 in s, ms, us or ns (told by their size); without zone they are UTC.
     points
         Semantic points, likewise (not GPX). Kinds may have the names in `probe2road.io.columns.KIND_SYNONYMS`.
+    format
+        The parameters below in one object, for example out of a TOML file; a parameter that is given, too, takes the
+        place of its field. None leaves what the format says, and what a `FleetFormat` says by default.
     columns, point_columns
         Our column name to the file's, for example ``{"trace_id": "trip"}``; ``geometry`` names a column of
         points. An empty name says that there is no such column. What is not named is found by its usual name
@@ -72,9 +76,9 @@ def read_fleet(
         ``(left, bottom, right, top)`` in the CRS of the files (degrees for longitude and latitude): only fixes
         and points inside are read. In Parquet, row groups outside are skipped.
     delimiter
-        Of text tables; told from the first line where it is None.
+        Of text tables; told from the first line where it is not given.
     header
-        Whether text tables start with a line of names; without, the columns are called 0, 1, 2.
+        Whether text tables start with a line of names, as they do by default; without, the columns are called 0, 1, 2.
 
     Returns
     -------
@@ -102,37 +106,32 @@ def read_fleet(
     >>> fleet.crs.to_epsg(), fleet.traces["trace_id"].tolist()
     (32616, [7])
     """
-    given = None if crs is None else parse_crs(crs)
-    box = None if bbox is None else _checked_bbox(bbox)
-    if delimiter is not None and len(delimiter) != 1:
-        raise OptionError(f"delimiter {delimiter!r} is not one character", fix="use one, or leave it out")
-    options = _Options(given, box, delimiter, header)
-    trace_table, trace_crs, told = _read_all(traces, columns or {}, options, points=False)
+    format = adjusted(
+        format or FleetFormat(),
+        columns=columns,
+        point_columns=point_columns,
+        crs=crs,
+        target_crs=target_crs,
+        bbox=bbox,
+        delimiter=delimiter,
+        header=header,
+    )
+    trace_table, trace_crs, told = _read_all(traces, format, points=False)
     point_table, point_crs = None, trace_crs
     if points is not None:
-        point_table, point_crs, _ = _read_all(points, point_columns or {}, options, points=True)
+        point_table, point_crs, _ = _read_all(points, format, points=True)
     where = _name(traces)
     if trace_table is None:
         fix = f"bbox is (left, bottom, right, top) in the CRS of the data, {trace_crs.name}"
-        raise InputError(f"no fixes inside bbox {bbox}", where=where, fix=fix)
+        raise InputError(f"no fixes inside bbox {format.bbox}", where=where, fix=fix)
     fleet = fleet_from_checked(
-        trace_table, point_table, crs=trace_crs, points_crs=point_crs, target_crs=target_crs, where=where
+        trace_table, point_table, crs=trace_crs, points_crs=point_crs, target_crs=format.target_crs, where=where
     )
     logger.info(
         "read %d fixes of %d traces and %d semantic points from %s (%s)",
         *(len(fleet.traces), fleet.n_traces, len(fleet.points), where, told),
     )
     return fleet
-
-
-@dataclass(frozen=True)
-class _Options:
-    """What `read_fleet` was told about all files alike."""
-
-    crs: CRS | None
-    bbox: BBox | None
-    delimiter: str | None
-    header: bool
 
 
 def read_fleet_files(path: str | PathLike[str]) -> Fleet:
@@ -158,17 +157,7 @@ def read_fleet_files(path: str | PathLike[str]) -> Fleet:
     return read_fleet(path, points if points.exists() else None)
 
 
-def _checked_bbox(bbox: Sequence[float]) -> BBox:
-    """Return a bounding box of four ordered numbers."""
-    numbers = tuple(map(float, bbox))
-    if len(numbers) != 4 or not (numbers[0] < numbers[2] and numbers[1] < numbers[3]):
-        raise OptionError(f"bbox {numbers} is no box", fix="use (left, bottom, right, top), left < right, bottom < top")
-    return numbers
-
-
-def _read_all(
-    source: Source, columns: Mapping[str, Any], options: _Options, *, points: bool
-) -> tuple[pd.DataFrame | None, CRS, str]:
+def _read_all(source: Source, format: FleetFormat, *, points: bool) -> tuple[pd.DataFrame | None, CRS, str]:
     """Read and check all files of one kind of table; the table (None if empty), its CRS, what was guessed."""
     files, left_out = find_sources(source, semantic_points=points)
     if left_out:
@@ -179,9 +168,9 @@ def _read_all(
     errors: list[InputError] = []
     for file in files:
         try:
-            raw = _read_one(file, columns, options, points=points)
-            crs = _crs_of(raw, file, options.crs)
-            table = _checked_table(raw, file, crs, options.bbox, points=points)
+            raw = _read_one(file, format, points=points)
+            crs = _crs_of(raw, file, format.stated_crs)
+            table = _checked_table(raw, file, crs, format.bbox, points=points)
         except InputError as error:
             errors.append(error)
             continue
@@ -196,19 +185,12 @@ def _read_all(
     return _concatenated(tables) if tables else None, crs, told
 
 
-def _read_one(file: SourceFile, columns: Mapping[str, Any], options: _Options, *, points: bool) -> RawTable:
-    """Read one file in its format."""
+def _read_one(file: SourceFile, format: FleetFormat, *, points: bool) -> RawTable:
+    """Read one file by the reader of its suffix."""
     if file.format == "parquet":
-        return read_parquet(file, columns=columns, points=points, crs=options.crs, bbox=options.bbox)
+        return read_parquet(file, format, points=points)
     if file.format == "text":
-        return read_text_table(
-            file,
-            columns=columns,
-            points=points,
-            crs=options.crs,
-            delimiter=options.delimiter,
-            header=options.header,
-        )
+        return read_text_table(file, format, points=points)
     if points:
         raise InputError("GPX holds no semantic points", where=file.path, fix="use a text table or Parquet")
     return read_gpx(file)
@@ -221,7 +203,7 @@ def _crs_of(raw: RawTable, file: SourceFile, given: CRS | None) -> CRS:
         raise CRSError(fault, where=file.path, fix="leave the CRS out, or correct the file")
     crs = raw.crs or given or (WGS84 if raw.degrees else None)
     if crs is None:
-        raise CRSError("no CRS", where=file.path, fix="say which one it is, for example --crs EPSG:32616")
+        raise CRSError("no CRS", where=file.path, fix='say which one it is, for example crs="EPSG:32616"')
     return crs
 
 

@@ -13,6 +13,7 @@ from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldE
 from probe2road.errors import InputError, OptionError, OutputError
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.io.formats import GraphFormat, adjusted
 from probe2road.io.graph_networkx import read_graphml, write_graphml
 from probe2road.io.graph_readers import read_parquet_graph, read_vector_graph
 from probe2road.io.graph_writers import write_flatgeobuf, write_geojson, write_geopackage, write_geoparquet
@@ -64,7 +65,12 @@ def write_graph(graph: RoadGraph, path: str | PathLike[str]) -> None:
 
 
 def read_graph(
-    path: str | PathLike[str], *, crs: Any = None, target_crs: Any = None, layer: str | None = None
+    path: str | PathLike[str],
+    *,
+    format: GraphFormat | None = None,
+    crs: Any = None,
+    target_crs: Any = None,
+    layer: str | None = None,
 ) -> RoadGraph:
     """Read a road graph from a file, in the format that its suffix names.
 
@@ -76,6 +82,8 @@ def read_graph(
     ----------
     path
         File with a suffix of `READABLE`.
+    format
+        The parameters below in one object; a parameter that is given, too, takes the place of its field.
     crs
         CRS of the coordinates, for a file that names none.
     target_crs
@@ -92,18 +100,19 @@ def read_graph(
     OptionError
         If the suffix is of no format we read.
     """
+    format = adjusted(format or GraphFormat(), crs=crs, target_crs=target_crs, layer=layer)
     kind = graph_format(path, READABLE)
     if not Path(path).is_file():
         raise InputError("no such file", where=path, fix="check the path")
     if Path(path).stat().st_size == 0:
         raise InputError("the file is empty", where=path, fix="check that it is complete")
     if kind == "OSM":
-        return read_osm(path, target_crs=target_crs)
+        return read_osm(path, target_crs=format.target_crs)
     if kind == "GraphML":
-        return read_graphml(path, target_crs=target_crs)
+        return read_graphml(path, target_crs=format.target_crs)
     if kind == "GeoParquet":
-        return read_parquet_graph(path, crs=crs, target_crs=target_crs)
-    return read_vector_graph(path, crs=crs, target_crs=target_crs, layer=layer)
+        return read_parquet_graph(path, crs=format.crs, target_crs=format.target_crs)
+    return read_vector_graph(path, crs=format.crs, target_crs=format.target_crs, layer=format.layer)
 
 
 WRITABLE = {

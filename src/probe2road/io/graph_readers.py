@@ -155,7 +155,9 @@ def _edge_layer(layers: list[str], wanted: str | None, path: Path) -> str:
         wanted = "edges" if "edges" in layers else layers[0] if len(layers) == 1 else None
     if wanted is None or wanted not in layers:
         what = f"has no layer {wanted!r}" if wanted else "has several layers, and none is called 'edges'"
-        raise InputError(f"{what} (there are: {', '.join(layers)})", where=path, fix="name the layer of the edges")
+        example = f', for example layer="{layers[0]}"' if layers else ""
+        fix = f"name the layer of the edges{example}"
+        raise InputError(f"{what} (there are: {', '.join(layers)})", where=path, fix=fix)
     return wanted
 
 

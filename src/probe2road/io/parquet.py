@@ -17,34 +17,30 @@ from probe2road.crs import parse_crs
 from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin
 from probe2road.io.columns import ColumnChoice, choose_columns, standard_kinds, times_from_numbers
+from probe2road.io.formats import BBox, FleetFormat
 from probe2road.io.sources import RawTable, SourceFile
 from probe2road.io.wkb import point_coordinates
 
 __all__ = ["inside", "read_parquet"]
 
-BBox = tuple[float, float, float, float]
-
 _DEFAULT_CRS = "OGC:CRS84"  # GeoParquet 1.1: what a geometry column without a "crs" is in
 
 
-def read_parquet(
-    source: SourceFile,
-    *,
-    columns: Mapping[str, Any] | None = None,
-    points: bool = False,
-    crs: CRS | None = None,
-    bbox: BBox | None = None,
-) -> RawTable:
+def read_parquet(source: SourceFile, format: FleetFormat | None = None, *, points: bool = False) -> RawTable:
     """Read one Parquet or GeoParquet file.
 
     A geometry column of points (WKB, or GeoArrow as GeoParquet 1.1 allows it) is preferred to coordinate
     columns that the user did not name, and brings its CRS. Folder names of the form ``key=value`` count as
-    columns. ``bbox`` skips row groups where the file has statistics of coordinate columns or of a covering.
+    columns. The bounding box skips row groups where the file has statistics of coordinate columns or of a covering.
 
     Parameters
     ----------
-    source, columns, points, crs, bbox
-        As for `probe2road.read_fleet`.
+    source
+        The file.
+    format
+        What the user says of the columns, the CRS and the bounding box; nothing where it is None.
+    points
+        Whether the file holds semantic points rather than traces.
 
     Returns
     -------
@@ -56,12 +52,19 @@ def read_parquet(
     InputError
         If the file is no complete Parquet file, or its columns cannot be told.
     """
+    format = format or FleetFormat()
+    bbox = format.bbox
     try:
         dataset = ds.dataset(str(source.path), format="parquet", partitioning="hive")
         geo = _geo_metadata(dataset.schema, source)
         geometry = geo["primary_column"] if geo else None
         choice = choose_columns(
-            dataset.schema.names, columns, points=points, geometry=geometry, crs=crs, where=source.path
+            dataset.schema.names,
+            format.columns_of(points=points),
+            points=points,
+            geometry=geometry,
+            crs=format.stated_crs,
+            where=source.path,
         )
         about = geo["columns"].get(choice.columns.get("geometry"), {}) if geo else {}
         condition = None if bbox is None else _row_filter(choice, about, dataset.schema, bbox)

@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 _STEPS = np.float32(2**16)  # of the probability between 0 and 1: fewer digits, which compress
 _LARGEST_OVERLAP = 0.9
 _RIGHT_ANGLES = 4
-_NO_NETWORK = "use --segmenter density"
+_NO_NETWORK = 'use segmenter="density"'
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def network_segmenter(weights: Weights, grid: Grid, options: NetworkOptions | No
         raise OptionError(
             f"the network sees pixels of {info.resolution} m, the raster has {grid.resolution} m",
             where=weights.path,
-            fix=f"use --resolution {info.resolution} or --segmenter density",
+            fix=f'use resolution={info.resolution} or segmenter="density"',
         )
     network = load_network(weights, device=options.device, threads=options.threads)
     channels = [CHANNELS.index(name) for name in info.channels]

@@ -30,7 +30,7 @@ _INFO, _DIGEST = b"probe2road", b"probe2road.digest"  # keys of our metadata
 _METADATA_FIELD = 14  # metadata_props in ONNX's ModelProto: messages of a key (1) and a value (2)
 _TEXT = 2  # wire type of length-delimited fields, the only one in metadata
 _FIXED_BYTES = {1: 8, 5: 4}  # of the wire types of fixed length
-_NOT_OURS = "use a file that probe2road train has exported, or --segmenter density"
+_NOT_OURS = 'use a file that probe2road train has exported, or segmenter="density"'
 _COPY = "copy the file again"
 
 

@@ -160,7 +160,9 @@ def load_network(data: Dataset, folder: str | Path) -> RoadNetwork:
     if not data.generated:
         path = Path(folder) / data.network
         if not path.is_file():
-            raise InputError("there is no such extract", where=path, fix="name the folder of extracts with --data")
+            raise InputError(
+                "there is no such extract", where=path, fix='name the folder of extracts, for example data="extracts"'
+            )
         return main_roads(read_network(path, highways=(*MAIN_ROADS, *PRIMARY_ROADS)))
     _, kind, seed = data.network.split(":")
     rng = np.random.default_rng(int(seed))
