@@ -101,7 +101,7 @@ def test_a_config_says_how_to_read_and_the_command_line_wins(folder, capsys):
 
 
 def test_a_build_and_an_alignment_read_by_their_config(folder, capsys):
-    (folder / "build.toml").write_text(f'segmenter = "density"\n{FORMAT}bbox = [0, 0, 1, 1]\n')
+    (folder / "build.toml").write_text(f'[segmentation]\nsegmenter = "density"\n\n{FORMAT}bbox = [0, 0, 1, 1]\n')
     code, _, err = call(capsys, "build", "drives.txt", "--config", "build.toml", "-o", "roads.gpkg")
     assert code == 2
     assert "no fixes inside bbox (0.0, 0.0, 1.0, 1.0)" in err
