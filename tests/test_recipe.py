@@ -174,7 +174,7 @@ def test_options_behind_the_segmentation_keep_its_probability(crossing, tmp_path
 
 
 def test_an_unknown_thinning_is_refused():
-    with pytest.raises(OptionError, match="there is no thinning 'medial'"):
+    with pytest.raises(OptionError, match="thinning is 'medial'"):
         BuildOptions(thinning="medial")
 
 

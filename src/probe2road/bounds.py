@@ -246,9 +246,9 @@ def _words(hint: Any) -> str:
         noun = "a list" if arguments[-1] is Ellipsis else f"a list of {len(arguments)} values"
         return f"{noun} {limits}".rstrip()
     if origin in MAPPINGS:
-        return "a mapping, in TOML a table"
+        return "a mapping (in TOML a table)"
     if is_dataclass(kind):
-        return f"{getattr(kind, '__name__', kind)}, in TOML a table"
+        return f"{getattr(kind, '__name__', kind)} (in TOML a table)"
     return {bool: "true or false", Path: "a path", NoneType: "None"}.get(kind, str(kind))
 
 

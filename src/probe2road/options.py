@@ -4,7 +4,10 @@ Strategy
 --------
 A dataclass of options says what it wants where it says the unit:
 
-    max_length: NotNegative[float] = 50.0  # m; longer links are never made
+    @dataclass(frozen=True)
+    @checked
+    class GapOptions:
+        max_length: NotNegative[float] = 50.0  # m; longer links are never made
 
 `checked` reads type and bounds (`probe2road.bounds`) from there and checks them whenever an object is made: in Python,
 from the command line, or from a TOML file. So there is one list of what is allowed, and one way to say what is wrong.
@@ -42,26 +45,19 @@ def checked(kind: type[T]) -> type[T]:
 
     Examples
     --------
-    >>> from dataclasses import dataclass
-    >>> from typing import Annotated
-    >>> from probe2road.bounds import AtLeast, AtMost, Positive
-    >>> @dataclass(frozen=True)
-    ... @checked
-    ... class Taps:
-    ...     flow: Positive[float] = 1.0  # l/s
-    ...     count: Annotated[int, AtLeast(1), AtMost(9)] = 2
-    >>> Taps(flow=3)
-    Taps(flow=3.0, count=2)
-    >>> Taps(flow=float("inf"))
+    >>> from probe2road.graph.clean import CleanOptions
+    >>> CleanOptions(dead_end=20)
+    CleanOptions(short_edge=15.0, max_ring=120.0, dead_end=20.0, component=15.0)
+    >>> CleanOptions(dead_end=float("inf"))
     Traceback (most recent call last):
         ...
-    probe2road.errors.OptionError: Taps: flow is inf; use a number above 0
-    >>> Taps(flow=-1, count=0)
+    probe2road.errors.OptionError: CleanOptions: dead_end is inf; use a number of at least 0
+    >>> CleanOptions(short_edge="long", component=-1)
     Traceback (most recent call last):
         ...
-    probe2road.errors.OptionError: Taps: 2 faults
-      1. flow is -1; use a number above 0
-      2. count is 0; use a whole number of at least 1 and at most 9
+    probe2road.errors.OptionError: CleanOptions: 2 faults
+      1. short_edge is 'long'; use a number of at least 0
+      2. component is -1; use a number of at least 0
     """
     if "__dataclass_fields__" in vars(kind):
         raise TypeError(f"{kind.__name__}: @checked stands below @dataclass, which would not call it otherwise")

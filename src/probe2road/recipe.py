@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import Annotated, cast
 
-from probe2road.errors import OptionError
+from probe2road.bounds import OneOf
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.options import checked
 from probe2road.raster.counts import fleet_grid
 from probe2road.refinement.recipe import RefineOptions, refine
 from probe2road.run.progress import Progress, silent
@@ -27,21 +28,17 @@ __all__ = ["BuildOptions", "build"]
 
 
 @dataclass(frozen=True)
+@checked
 class BuildOptions:
     """Everything that decides which graph comes out."""
 
     segmentation: SegmentationOptions = field(default_factory=SegmentationOptions)  # what decides the probability
     mask: MaskOptions = field(default_factory=MaskOptions)  # which probability makes a road
-    thinning: str = "guo_hall"  # how the mask becomes lines of one pixel; or zhang_suen
+    thinning: Annotated[str, OneOf(*METHODS)] = "guo_hall"  # how the mask becomes lines of one pixel; or zhang_suen
     vectorize: VectorizeOptions = field(default_factory=VectorizeOptions)  # how pixels become lines
     clean: CleanOptions = field(default_factory=CleanOptions)  # what counts as a flaw
     refine: bool = True  # whether the traces fill gaps, split false junctions and are counted
     refinement: RefineOptions = field(default_factory=RefineOptions)  # how they do
-
-    def __post_init__(self) -> None:
-        """Refuse an unknown thinning."""
-        if self.thinning not in METHODS:
-            raise OptionError(f"there is no thinning {self.thinning!r}", fix=f"use {' or '.join(METHODS)}")
 
 
 def build(

@@ -128,7 +128,10 @@ def test_options_come_from_toml(folder, call):
             "--weights: segmenter density runs no network; use --segmenter network",
         ),
         (["build", "drives.csv", *COLUMNS, "--config", "wrong.toml", "-o", "x.gpkg"], "there is no option 'bandwith'"),
-        (["build", "drives.csv", *COLUMNS, "--config", "type.toml", "-o", "x.gpkg"], "is not of type float"),
+        (
+            ["build", "drives.csv", *COLUMNS, "--config", "type.toml", "-o", "x.gpkg"],
+            "type.toml: resolution is 'fine'; use a number",
+        ),
         (["evaluate", "absent.gpkg", "absent.gpkg"], "absent.gpkg: no such file"),
         (["view", "absent.gpkg", "-o", "roads.pdf"], "use .html or .png"),
         (["info", "absent.parquet"], "absent.parquet: there is no such file"),

@@ -343,11 +343,11 @@ def test_published_decides_with_bounded_memory() -> None:
 def test_options_come_from_tables_and_are_checked() -> None:
     options = options_from_table({"profile": "fleet", "fleet": {"sigma": 7}}, MatchOptions)
     assert options.fleet.sigma == 7.0
-    with pytest.raises(OptionError, match="profile is 'quick'; use auto, fleet"):
+    with pytest.raises(OptionError, match="profile is 'quick'; use auto, fleet, sparse or published"):
         MatchOptions(profile="quick")
-    with pytest.raises(OptionError, match="RouteModel: sigma is 0; use a positive number"):
+    with pytest.raises(OptionError, match="RouteModel: sigma is 0; use a number above 0"):
         RouteModel(sigma=0)
-    with pytest.raises(OptionError, match="PublishedModel: stay is 2; use at most 1"):
+    with pytest.raises(OptionError, match="PublishedModel: stay is 2; use a number of at least 0 and at most 1"):
         PublishedModel(stay=2)
 
 

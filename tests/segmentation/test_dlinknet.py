@@ -88,7 +88,7 @@ def test_positions_tell_places_apart():
 def test_unknown_names_and_sizes_are_refused():
     with pytest.raises(OptionError, match="there is no architecture 'unet'; use one of dlinknet34"):
         find_architecture("unet")
-    with pytest.raises(OptionError, match="there is no centre 'lstm'"):
+    with pytest.raises(OptionError, match="centre is 'lstm'; use dilated or transformer"):
         Architecture(centre="lstm")
-    with pytest.raises(OptionError, match="width 12"):
+    with pytest.raises(OptionError, match="width is 12"):
         Architecture(width=12)

@@ -51,7 +51,7 @@ def test_thresholds_must_be_in_order():
     [
         ({"threshold": 1.5}, "threshold is 1.5"),
         ({"seed_threshold": 0.0}, "seed_threshold is 0.0"),
-        ({"threshold": 0.6, "seed_threshold": 0.5}, "threshold 0.6 and seed_threshold 0.5 are not in order"),
+        ({"threshold": 0.6, "seed_threshold": 0.5}, "threshold is 0.6, seed_threshold is 0.5"),
     ],
 )
 def test_mask_options_that_mean_nothing_are_refused(options: dict[str, float], fault: str) -> None:

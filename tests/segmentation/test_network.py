@@ -167,7 +167,7 @@ def test_options_take_precedence_over_the_model(write_weights):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"device": "tpu"}, "there is no device 'tpu'; use cpu or cuda"),
+        ({"device": "tpu"}, "NetworkOptions: device is 'tpu'; use cpu or cuda"),
         ({"overlap": 1.0}, "overlap is 1.0"),
         ({"overlap": -0.5}, "overlap is -0.5"),
         ({"threads": 0}, "threads is 0"),

@@ -170,9 +170,9 @@ def test_a_preset_file_changes_what_it_names(tmp_path):
     [
         ("base = 'sunny'", "base 'sunny' is unknown"),
         ("[camera]\nzoom = 3", "there is no option 'zoom'"),
-        ("[camera]\nfar = 'wide'", "camera: far: 'wide' is not of type float"),
+        ("[camera]\nfar = 'wide'", "camera: far is 'wide'; use a number above 0"),
         ("[lidar]\nrange = 3", "there is no option 'lidar'"),
-        ("base = 'phone'\n[camera]\nfar = 3", "is not of type CameraModel"),
+        ("base = 'phone'\n[camera]\nfar = 3", "camera: there is no near and no half_angle"),
         ("[camera", "is not TOML"),
     ],
 )

@@ -137,7 +137,7 @@ def test_clear_errors(sets, tmp_path):
         open_scene(Source("milan"), sets)
     with pytest.raises(OptionError, match="give the name of a data set"):
         Source("mine", fleet="drives.csv")
-    with pytest.raises(OptionError, match="there is no rotation 'some'"):
+    with pytest.raises(OptionError, match="rotation is 'some'"):
         SampleOptions(rotation="some")
     fleet = fleet_from_tables(
         read_fleet(Recording(sets / DATASET).modelled).traces, crs="EPSG:32632", target_crs="EPSG:32632"

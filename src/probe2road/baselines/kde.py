@@ -13,10 +13,11 @@ from pathlib import Path
 from probe2road.baselines.volume import count_voxels, dense_pillars
 from probe2road.baselines.volume_graph import graph_from_volume
 from probe2road.baselines.volume_skeleton import thin_volume
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative, Positive
 from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.options import checked
 from probe2road.raster.counts import fleet_grid
 from probe2road.raster.grid import Grid
 from probe2road.run.progress import Progress, silent
@@ -29,26 +30,21 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
+@checked
 class KdeOptions:
     """The parameters, of which the paper publishes none.
 
     The three that make the density were chosen by ``experiments/fit_kde.py``.
     """
 
-    resolution: float = 1.0  # m, side of a voxel in plan
-    height: float = 3.0  # m, of a voxel
-    sigma: float = 1.5  # m, of the Gaussian in plan
-    sigma_vertical: float = 2.0  # m, of the Gaussian in height
-    threshold: float = 2.0  # traces on one line whose density is enough
+    resolution: Positive[float] = 1.0  # m, side of a voxel in plan
+    height: Positive[float] = 3.0  # m, of a voxel
+    sigma: Positive[float] = 1.5  # m, of the Gaussian in plan
+    sigma_vertical: Positive[float] = 2.0  # m, of the Gaussian in height
+    threshold: Positive[float] = 2.0  # traces on one line whose density is enough
     gaps: TraceGaps = field(default_factory=TraceGaps)  # where traces are broken
-    simplify_tolerance: float = 1.0  # m, Douglas-Peucker
+    simplify_tolerance: NotNegative[float] = 1.0  # m, Douglas-Peucker
     clean: CleanOptions | None = field(default_factory=CleanOptions)  # what counts as a flaw; None cleans nothing
-
-    def __post_init__(self) -> None:
-        """Refuse lengths and thresholds that are not positive."""
-        for name in ("resolution", "height", "sigma", "sigma_vertical", "threshold"):
-            if not getattr(self, name) > 0:
-                raise OptionError(f"{name} is {getattr(self, name)}", where="KDE", fix="use a number above 0")
 
 
 def build_kde(

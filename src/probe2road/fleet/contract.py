@@ -11,8 +11,9 @@ import pandas as pd
 from numpy.typing import NDArray
 from pyproj import CRS
 
+from probe2road.bounds import NotNegative, Positive
 from probe2road.crs import WGS84, is_true_to_scale, local_crs, parse_crs, require_metric, transform, turn_headings
-from probe2road.errors import CRSError, InputError, OptionError
+from probe2road.errors import CRSError, InputError
 from probe2road.fleet.tables import (
     POINT_KINDS,
     check_points,
@@ -22,6 +23,7 @@ from probe2road.fleet.tables import (
     run_starts,
     sort_fixes,
 )
+from probe2road.options import checked
 
 __all__ = [
     "POINT_KINDS",
@@ -97,6 +99,7 @@ class Fleet:
 
 
 @dataclass(frozen=True)
+@checked
 class TraceGaps:
     """Where a trace is broken: no vehicle is known to have driven straight across (METHOD 0.1 row 3).
 
@@ -104,18 +107,12 @@ class TraceGaps:
     with a fix every ten seconds has a gap when three are missing, not between any two.
     """
 
-    max_interval: float = 5.0  # s, between consecutive fixes
-    max_step: float = 150.0  # m, between consecutive fixes
-    standing_step: float = 30.0  # m; over a shorter step time alone is no gap: the vehicle waited, or sends by distance
-    interval_factor: float = 3.0  # x the trace's median interval, where that is more than max_interval
-    step_factor: float = 3.0  # x the trace's median moving step, where that is more than max_step
-    max_speed: float = 70.0  # m/s; a faster step is a jump of the position, not driving
-
-    def __post_init__(self) -> None:
-        """Refuse limits that would break every trace everywhere."""
-        for name in ("max_interval", "max_step", "standing_step", "max_speed"):
-            if not getattr(self, name) > 0:
-                raise OptionError(f"{name} is {getattr(self, name)}", where="TraceGaps", fix="use a positive number")
+    max_interval: Positive[float] = 5.0  # s, between consecutive fixes
+    max_step: Positive[float] = 150.0  # m, between consecutive fixes
+    standing_step: Positive[float] = 30.0  # m; over a shorter step time alone is no gap: vehicles wait, or send rarely
+    interval_factor: NotNegative[float] = 3.0  # x the trace's median interval, where that is more than max_interval
+    step_factor: NotNegative[float] = 3.0  # x the trace's median moving step, where that is more than max_step
+    max_speed: Positive[float] = 70.0  # m/s; a faster step is a jump of the position, not driving
 
 
 def trace_breaks(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool_]:

@@ -21,10 +21,12 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from probe2road.bounds import NotNegative
 from probe2road.errors import OptionError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import finish_edges
 from probe2road.graph.topology import Network, chains, contract_short_edges, end_nodes, joined_lines, mates
+from probe2road.options import checked
 
 __all__ = [
     "CleanOptions",
@@ -42,18 +44,14 @@ _STRENGTH = {"segmentation": 0, "reference": 1, "gap": 2}  # a chain takes the o
 
 
 @dataclass(frozen=True)
+@checked
 class CleanOptions:
     """What counts as a flaw of a graph."""
 
-    short_edge: float = 15.0  # m; edges between junctions up to this long are collapsed; 0 keeps all
-    max_ring: float = 120.0  # m; rings with a perimeter of 2 short_edge up to this keep their edges
-    dead_end: float = 15.0  # m; shorter dead ends and isolated edges are dropped; 0 keeps all
-    component: float = 15.0  # m; shorter components are dropped; 0 keeps all
-
-    def __post_init__(self) -> None:
-        """Refuse negative lengths."""
-        for name in ("short_edge", "max_ring", "dead_end", "component"):
-            _require_length(getattr(self, name), name)
+    short_edge: NotNegative[float] = 15.0  # m; edges between junctions up to this long are collapsed; 0 keeps all
+    max_ring: NotNegative[float] = 120.0  # m; rings with a perimeter of 2 short_edge up to this keep their edges
+    dead_end: NotNegative[float] = 15.0  # m; shorter dead ends and isolated edges are dropped; 0 keeps all
+    component: NotNegative[float] = 15.0  # m; shorter components are dropped; 0 keeps all
 
 
 def clean_graph(graph: RoadGraph, *, options: CleanOptions | None = None) -> RoadGraph:

@@ -7,14 +7,16 @@ centreline only where at least N = 4 traces were matched to it.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
 
+from probe2road.bounds import Above, AtMost, NotNegative, OneOf, Positive
 from probe2road.crs import same_crs
-from probe2road.errors import CRSError, OptionError
+from probe2road.errors import CRSError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.splitting import split_edges
@@ -22,6 +24,7 @@ from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.matching.frame import frame
 from probe2road.matching.match import MatchOptions, match
 from probe2road.matching.osrm import OsrmOptions, osrm_network, osrm_segments, osrm_server
+from probe2road.options import checked
 
 __all__ = ["MATCHERS", "LabelOptions", "cut_reference", "label", "label_pieces"]
 
@@ -31,29 +34,18 @@ MATCHERS = ("own", "osrm")
 
 
 @dataclass(frozen=True)
+@checked
 class LabelOptions:
     """When a piece of a reference counts as driven (METHOD 5.2)."""
 
-    min_traces: int = 4  # distinct traces; the N of the paper
-    max_piece: float = 100.0  # m; longer edges are cut into equal pieces before counting, of half of this at least
-    min_share: float = 0.5  # of a piece that a trace has to cover
-    matcher: str = "own"  # one of MATCHERS
+    min_traces: NotNegative[int] = 4  # distinct traces; the N of the paper
+    max_piece: Positive[float] = 100.0  # m; longer edges are first cut into equal pieces of at least half of this
+    min_share: Annotated[float, Above(0), AtMost(1)] = 0.5  # of a piece that a trace has to cover
+    matcher: Annotated[str, OneOf(*MATCHERS)] = "own"  # which matcher finds the edges of a trace
     match: MatchOptions = field(default=MatchOptions())  # of our own matcher
     osrm: OsrmOptions = field(default=OsrmOptions())
     osrm_url: str | None = None  # of a server that runs on the graph that osrm_network makes of the cut reference
     osrm_folder: Path | None = None  # where OSRM's programs are, if not where find_osrm looks
-
-    def __post_init__(self) -> None:
-        """Refuse unknown matchers and numbers out of range."""
-        if self.matcher not in MATCHERS:
-            fix = f"use {' or '.join(MATCHERS)}"
-            raise OptionError(f"matcher is {self.matcher!r}", where="LabelOptions", fix=fix)
-        limits = {"min_traces": self.min_traces >= 0, "max_piece": self.max_piece > 0}
-        limits["min_share"] = 0 < self.min_share <= 1
-        for entry in fields(self):
-            if not limits.get(entry.name, True):
-                fault = f"{entry.name} is {getattr(self, entry.name)}"
-                raise OptionError(fault, where="LabelOptions", fix="use a positive number, and a share of at most 1")
 
 
 def label(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions | None = None) -> RoadGraph:

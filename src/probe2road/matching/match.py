@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from probe2road.bounds import OneOf, Positive
 from probe2road.crs import require_metric, same_crs
-from probe2road.errors import CRSError, InputError, OptionError
+from probe2road.errors import CRSError, InputError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import TURN_DTYPES
@@ -27,6 +29,7 @@ from probe2road.matching.observe import observe, sampling_interval, seconds
 from probe2road.matching.published import match_published
 from probe2road.matching.tables import fix_table, joined_paths, step_table
 from probe2road.matching.viterbi import parameters
+from probe2road.options import checked
 
 __all__ = ["PROFILES", "MatchOptions", "Matches", "match", "turn_counts"]
 
@@ -36,24 +39,16 @@ PROFILES = ("auto", "fleet", "sparse", "published")
 
 
 @dataclass(frozen=True)
+@checked
 class MatchOptions:
     """How to match."""
 
-    profile: str = "auto"  # one of PROFILES; "auto" takes "fleet" or "sparse", trace by trace
-    sparse_interval: float = 5.0  # s, median time between fixes from which "auto" takes "sparse"
+    profile: Annotated[str, OneOf(*PROFILES)] = "auto"  # "auto" takes "fleet" or "sparse", trace by trace
+    sparse_interval: Positive[float] = 5.0  # s, median time between fixes from which "auto" takes "sparse"
     respect_oneway: bool = True  # whether edges that driving_direction calls one-way are closed the other way
     fleet: RouteModel = field(default=FLEET)
     sparse: RouteModel = field(default=SPARSE)
     published: PublishedModel = field(default=PublishedModel())
-
-    def __post_init__(self) -> None:
-        """Refuse unknown profiles."""
-        if self.profile not in PROFILES:
-            raise OptionError(f"profile is {self.profile!r}", where="MatchOptions", fix=f"use {', '.join(PROFILES)}")
-        if not self.sparse_interval > 0:
-            raise OptionError(
-                f"sparse_interval is {self.sparse_interval}", where="MatchOptions", fix="use a positive number"
-            )
 
 
 @dataclass(frozen=True)

@@ -28,12 +28,14 @@ import osmium
 from numba import njit
 from numpy.typing import NDArray
 
+from probe2road.bounds import NotNegative, Positive, Share
 from probe2road.crs import WGS84, transform
 from probe2road.errors import InputError, MissingExtraError, OptionError, Probe2RoadError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.direction import driving_direction
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import courses, edge_lines, stations_along
+from probe2road.options import checked
 
 __all__ = ["OsrmNetwork", "OsrmOptions", "find_osrm", "osrm_network", "osrm_segments", "osrm_server"]
 
@@ -46,28 +48,25 @@ _START = 30.0  # s that a server may take to answer
 
 
 @dataclass(frozen=True)
+@checked
 class OsrmOptions:
     """How OSRM is asked (METHOD 5.2)."""
 
-    radius: float = 8.0  # m, 1 sigma of fixes; it looks for roads within three times that
-    min_confidence: float = 0.5  # sub-matchings below are dropped
-    spacing: float = 10.0  # m and
-    interval: float = 1.0  # s that lie between two fixes that are sent, at least
-    chunk: int = 200  # fixes in a request
-    overlap: int = 5  # fixes that a request repeats of the one before
-    vertex_spacing: float = 20.0  # m between vertices of the network, at most: the resolution of what was driven
+    radius: Positive[float] = 8.0  # m, 1 sigma of fixes; it looks for roads within three times that
+    min_confidence: Share = 0.5  # sub-matchings below are dropped
+    spacing: NotNegative[float] = 10.0  # m and
+    interval: NotNegative[float] = 1.0  # s that lie between two fixes that are sent, at least
+    chunk: Positive[int] = 200  # fixes in a request
+    overlap: NotNegative[int] = 5  # fixes that a request repeats of the one before
+    vertex_spacing: Positive[float] = 20.0  # m between vertices of the network, at most: resolution of what was driven
     respect_oneway: bool = True  # whether edges that driving_direction calls one-way are closed the other way
-    timeout: float = 60.0  # s for an answer
+    timeout: Positive[float] = 60.0  # s for an answer
 
     def __post_init__(self) -> None:
-        """Refuse chunks that do not advance and scales of zero."""
-        for name in ("radius", "vertex_spacing", "timeout"):
-            if not getattr(self, name) > 0:
-                fault = f"{name} is {getattr(self, name)}"
-                raise OptionError(fault, where="OsrmOptions", fix="use a positive number")
-        if not 0 <= self.overlap < self.chunk - 1:
+        """Refuse chunks that do not advance."""
+        if self.overlap >= self.chunk - 1:
             fault = f"overlap is {self.overlap}, chunk is {self.chunk}"
-            raise OptionError(fault, where="OsrmOptions", fix="use an overlap of 0 or more, and a larger chunk")
+            raise OptionError(fault, where="OsrmOptions", fix="use a larger chunk")
 
 
 @dataclass(frozen=True)

@@ -14,28 +14,26 @@ import shapely
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
+from probe2road.bounds import NotNegative, Positive
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.metrics.matching import require_positive
 from probe2road.metrics.network import EPSILON, Network, locate, shortest_arcs
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.scores import Score
+from probe2road.options import checked
 
 __all__ = ["AplsOptions", "apls", "apls_networks"]
 
 
 @dataclass(frozen=True)
+@checked
 class AplsOptions:
     """Parameters of APLS; the defaults are those of its authors' program."""
 
-    snap: float = 4.0  # m from a control point to the other graph; 6 to 8 suits a highway network at 1 m accuracy
-    spacing: float = 50.0  # m between control points along an edge
-    max_points: int = 1000  # control points that are drawn at random where there are more
-    min_length: float = 0.001  # m; shorter routes are not compared
-    seed: int = 0  # of the draw
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        require_positive("AplsOptions", snap=self.snap, spacing=self.spacing, max_points=self.max_points)
+    snap: Positive[float] = 4.0  # m from a control point to the other graph; 6 to 8 suits highways at 1 m accuracy
+    spacing: Positive[float] = 50.0  # m between control points along an edge
+    max_points: Positive[int] = 1000  # control points that are drawn at random where there are more
+    min_length: NotNegative[float] = 0.001  # m; shorter routes are not compared
+    seed: NotNegative[int] = 0  # of the draw
 
 
 def apls(proposal: RoadGraph, reference: RoadGraph, *, options: AplsOptions | None = None) -> Score:

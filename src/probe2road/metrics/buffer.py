@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from probe2road.bounds import NotEmpty, Positive
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.metrics.matching import require_positive
 from probe2road.metrics.network import Network
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.scores import Score
+from probe2road.options import checked
 
 __all__ = ["BufferGeoOptions", "buffer_geo", "buffer_geo_networks"]
 
 
 @dataclass(frozen=True)
+@checked
 class BufferGeoOptions:
     """Parameters of buffer GEO; the defaults are those of Tang et al."""
 
-    radii: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0)  # m, one score each
-    spacing: float = 1.0  # m, the longest stretch that one sample stands for
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        require_positive("BufferGeoOptions", spacing=self.spacing, **{f"radius {r}": r for r in self.radii})
+    radii: Annotated[tuple[Positive[float], ...], NotEmpty()] = (5.0, 10.0, 15.0, 20.0)  # m, one score each
+    spacing: Positive[float] = 1.0  # m, the longest stretch that one sample stands for
 
 
 def buffer_geo(proposal: RoadGraph, reference: RoadGraph, *, options: BufferGeoOptions | None = None) -> list[Score]:

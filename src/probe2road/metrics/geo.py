@@ -7,32 +7,28 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative, Positive
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.metrics.matching import Matching, candidate_pairs, match_one_to_one, require_positive
+from probe2road.metrics.matching import Matching, candidate_pairs, match_one_to_one
 from probe2road.metrics.network import Network
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import Samples, sample_edges
 from probe2road.metrics.scores import Score
+from probe2road.options import checked
 
 __all__ = ["HE_BALAKRISHNAN_2022", "GeoOptions", "GeoSamples", "geo", "geo_networks", "geo_samples"]
 
 
 @dataclass(frozen=True)
+@checked
 class GeoOptions:
     """Parameters of GEO; the defaults are the paper's."""
 
-    spacing: float = 11.0  # m between samples
-    radius: float = 6.0  # m, the largest distance of a match, inclusive
+    spacing: Positive[float] = 11.0  # m between samples
+    radius: Positive[float] = 6.0  # m, the largest distance of a match, inclusive
     matching: Matching = "greedy"  # greedy in proposal order, global (nearest pairs first) or optimal
-    max_angle: float | None = None  # degrees between matched samples' roads as undirected lines; None for no test
-    phases: int = 1  # sampling origins of the proposal to pool; 1 is the metric itself
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        require_positive("GeoOptions", spacing=self.spacing, radius=self.radius, phases=self.phases)
-        if self.matching not in ("greedy", "global", "optimal"):
-            raise OptionError(f"matching is {self.matching!r}", where="GeoOptions", fix="use greedy, global or optimal")
+    max_angle: NotNegative[float] | None = None  # degrees between the roads of matched samples, undirected; None: any
+    phases: Positive[int] = 1  # sampling origins of the proposal to pool; 1 is the metric itself
 
 
 @dataclass(frozen=True)

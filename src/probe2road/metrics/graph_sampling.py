@@ -3,41 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import Annotated
 
 import numpy as np
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotEmpty, Positive
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.metrics.matching import Matching, candidate_pairs, match_one_to_one, require_positive
+from probe2road.metrics.matching import Matching, candidate_pairs, match_one_to_one
 from probe2road.metrics.network import Network
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import Centres, Samples, component_roots, sample_around
 from probe2road.metrics.scores import Score
+from probe2road.options import checked
 
 __all__ = ["GraphSamplingOptions", "graph_sampling", "graph_sampling_networks"]
 
 
 @dataclass(frozen=True)
+@checked
 class GraphSamplingOptions:
     """Parameters of graph sampling."""
 
-    radii: tuple[float, ...] = (5.0, 10.0, 15.0)  # m, one score each
-    spacing: float = 5.0  # m of network distance between samples
-    max_angle: float = 45.0  # degrees between the roads of matched samples, as undirected lines
+    radii: Annotated[tuple[Positive[float], ...], NotEmpty()] = (5.0, 10.0, 15.0)  # m, one score each
+    spacing: Positive[float] = 5.0  # m of network distance between samples
+    max_angle: Positive[float] = 45.0  # degrees between the roads of matched samples, as undirected lines
     matching: Matching = "greedy"  # in proposal order; global or optimal as in `match_one_to_one`
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        require_positive(
-            "GraphSamplingOptions",
-            spacing=self.spacing,
-            max_angle=self.max_angle,
-            **{f"radius {r}": r for r in self.radii},
-        )
-        if self.matching not in ("greedy", "global", "optimal"):
-            raise OptionError(
-                f"matching is {self.matching!r}", where="GraphSamplingOptions", fix="use greedy, global or optimal"
-            )
 
 
 def graph_sampling(

@@ -18,37 +18,30 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative, Positive
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.metrics.matching import require_positive
 from probe2road.metrics.network import EPSILON, Network, locate
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import Centres, Samples, sample_around
 from probe2road.metrics.scores import Score, ratio
+from probe2road.options import checked
 
 __all__ = ["ItopoOptions", "Pairs", "itopo", "itopo_networks", "itopo_pairs"]
 
 
 @dataclass(frozen=True)
+@checked
 class ItopoOptions:
     """Parameters of iTOPO; the defaults are the paper's, read as METHOD 6.5 recommends."""
 
-    spacing: float = 11.0  # m between samples
-    radius: float = 6.0  # m, the largest distance of a match and of a projection, inclusive
-    reach: float = 30.0  # m of network distance around a centre
+    spacing: Positive[float] = 11.0  # m between samples
+    radius: Positive[float] = 6.0  # m, the largest distance of a match and of a projection, inclusive
+    reach: Positive[float] = 30.0  # m of network distance around a centre
     average: Literal["micro", "macro"] = "micro"  # sums over all pairs, or means of their ratios
     strict: bool = False  # precision from the proposal's nodes only, recall from the reference's only
-    tie: float = 0.1  # m; edges that much farther than the closest tie with it, and the direction decides
-    branch: float = 10.0  # m over which the direction of a branch is measured
+    tie: NotNegative[float] = 0.1  # m; edges that much farther than the closest tie with it, and the direction decides
+    branch: Positive[float] = 10.0  # m over which the direction of a branch is measured
     centre: Literal["projection", "node"] = "projection"  # or the other graph's nearest node, where one is in radius
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        require_positive("ItopoOptions", spacing=self.spacing, radius=self.radius, reach=self.reach, branch=self.branch)
-        if self.average not in ("micro", "macro"):
-            raise OptionError(f"average is {self.average!r}", where="ItopoOptions", fix="use micro or macro")
-        if self.centre not in ("projection", "node"):
-            raise OptionError(f"centre is {self.centre!r}", where="ItopoOptions", fix="use projection or node")
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,13 @@ import shapely
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
+from probe2road.bounds import Positive
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.metrics.matching import require_positive
 from probe2road.metrics.network import EPSILON, Network, locate, shortest_arcs
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.projection import direction_over, project_along
 from probe2road.metrics.scores import Score
+from probe2road.options import checked
 
 __all__ = ["JunctionOptions", "JunctionPairs", "junction_pairs", "junctions", "junctions_networks"]
 
@@ -29,20 +30,17 @@ _BATCH = 512  # nodes that distances are computed from at a time; bounds memory
 
 
 @dataclass(frozen=True)
+@checked
 class JunctionOptions:
     """Parameters of junction connectivity; the defaults are those of the refinement's junction suite."""
 
-    arm: float = 35.0  # m from a place at which its arms are looked up, at most half the arm
-    radius: float = 10.0  # m from there to an edge of the proposal, inclusive
-    max_angle: float = 30.0  # degrees between the two, as undirected lines
-    span: float = 2.0  # m to either side over which the direction of a road is taken
-    detour: float = 1.5  # a way connects two arms up to so many times the distance by way of their place ...
-    slack: float = 20.0  # m more
-    same_node: float = 4.0  # m; edges that cross so close to a node they share do not cross
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        require_positive("JunctionOptions", **asdict(self))
+    arm: Positive[float] = 35.0  # m from a place at which its arms are looked up, at most half the arm
+    radius: Positive[float] = 10.0  # m from there to an edge of the proposal, inclusive
+    max_angle: Positive[float] = 30.0  # degrees between the two, as undirected lines
+    span: Positive[float] = 2.0  # m to either side over which the direction of a road is taken
+    detour: Positive[float] = 1.5  # a way connects two arms up to so many times the distance by way of their place ...
+    slack: Positive[float] = 20.0  # m more
+    same_node: Positive[float] = 4.0  # m; edges that cross so close to a node they share do not cross
 
 
 @dataclass(frozen=True)

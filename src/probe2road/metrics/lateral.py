@@ -7,29 +7,27 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from probe2road.bounds import Positive
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.metrics.matching import require_positive
 from probe2road.metrics.network import EPSILON, Network, locate
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.projection import direction_over, project_along
 from probe2road.metrics.sampling import sample_edges
 from probe2road.metrics.scores import Score
+from probe2road.options import checked
 
 __all__ = ["LateralOptions", "lateral", "lateral_gaps", "lateral_networks"]
 
 
 @dataclass(frozen=True)
+@checked
 class LateralOptions:
     """Parameters of the lateral error."""
 
-    spacing: float = 2.0  # m between samples
-    radius: float = 6.0  # m, the largest distance from a sample to a road of the other graph, inclusive
-    max_angle: float = 30.0  # degrees between the sample's road and the other, as undirected lines
-    span: float = 2.0  # m to either side over which the direction of a road is taken
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        require_positive("LateralOptions", **asdict(self))
+    spacing: Positive[float] = 2.0  # m between samples
+    radius: Positive[float] = 6.0  # m, the largest distance from a sample to a road of the other graph, inclusive
+    max_angle: Positive[float] = 30.0  # degrees between the sample's road and the other, as undirected lines
+    span: Positive[float] = 2.0  # m to either side over which the direction of a road is taken
 
 
 def lateral(proposal: RoadGraph, reference: RoadGraph, *, options: LateralOptions | None = None) -> Score:

@@ -8,18 +8,21 @@ bipartite graph without edges between starts, so that one call of Hopcroft and K
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import Annotated
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from probe2road.bounds import AtLeast, Below, Positive
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.metrics.matching import match_one_to_one, require_positive
+from probe2road.metrics.matching import match_one_to_one
 from probe2road.metrics.network import EPSILON, Network
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.projection import project_along
 from probe2road.metrics.sampling import Centres, Samples, component_roots, sample_around
 from probe2road.metrics.scores import Score, ratio
+from probe2road.options import checked
 
 __all__ = ["TopoOptions", "topo", "topo_networks"]
 
@@ -27,22 +30,18 @@ _BATCH = 512  # starts matched together; bounds memory
 
 
 @dataclass(frozen=True)
+@checked
 class TopoOptions:
     """Parameters of TOPO; the defaults are Sat2Graph's, in metres."""
 
-    start_spacing: float = 50.0  # m of network distance between starts on the reference
-    start_radius: float = 11.0  # m from a start to its partner on the proposal
-    start_angle: float = 15.0  # degrees between the roads of a start and its partner, as undirected lines
-    reach: float = 300.0  # m of network distance that is explored
-    spacing: float = 5.5  # m of network distance between marbles
-    radius: float = 11.0  # m, the largest distance of a match
-    max_angle: float = 45.0  # degrees between the roads of two matched marbles, as undirected lines
-    margin: float = 0.0  # share of the reference's extent on each side where no start lies; Sat2Graph has 0.07
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        positive = {name: value for name, value in asdict(self).items() if name != "margin"}
-        require_positive("TopoOptions", **positive)
+    start_spacing: Positive[float] = 50.0  # m of network distance between starts on the reference
+    start_radius: Positive[float] = 11.0  # m from a start to its partner on the proposal
+    start_angle: Positive[float] = 15.0  # degrees between the roads of a start and its partner, as undirected lines
+    reach: Positive[float] = 300.0  # m of network distance that is explored
+    spacing: Positive[float] = 5.5  # m of network distance between marbles
+    radius: Positive[float] = 11.0  # m, the largest distance of a match
+    max_angle: Positive[float] = 45.0  # degrees between the roads of two matched marbles, as undirected lines
+    margin: Annotated[float, AtLeast(0), Below(0.5)] = 0.0  # share a side without starts; Sat2Graph has 0.07
 
 
 def topo(proposal: RoadGraph, reference: RoadGraph, *, options: TopoOptions | None = None) -> Score:

@@ -15,7 +15,7 @@ that would fold is moved less, or not at all.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import geopandas as gpd
 import numpy as np
@@ -23,8 +23,9 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
+from probe2road.bounds import NotNegative, Positive, Share
 from probe2road.crs import same_crs
-from probe2road.errors import CRSError, OptionError
+from probe2road.errors import CRSError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import (
@@ -40,6 +41,7 @@ from probe2road.matching.frame import (
     stations_along,
 )
 from probe2road.matching.match import Matches
+from probe2road.options import checked
 
 __all__ = ["CentrelineOptions", "refine_centreline"]
 
@@ -49,31 +51,23 @@ _STEPS = (1.0, 0.5, 0.25, 0.0)  # shares of its shift that an edge is tried with
 
 
 @dataclass(frozen=True)
+@checked
 class CentrelineOptions:
     """How far the traces may move an edge."""
 
-    spacing: float = 10.0  # m between stations, at most
-    reach: float = 80.0  # m; wiggles of the shift that are shorter are levelled
-    max_shift: float = 5.0  # m
-    max_left: float = 20.0  # m; fixes farther aside do not vote
-    prior_sigma: float = 4.0  # m, by which the present course is expected to be off
-    vote_sigma: float = 1.5  # m, least spread of votes about the middle, lanes included
-    min_traces: int = 3  # on an edge; with fewer it stays
-    two_way_share: float = 0.1  # of the votes that the rarer direction has on a road driven both ways
-    max_gap: float = 6.0  # m between the two directions; an edge whose traffic is farther apart is two roads, and stays
-    fade: float = 25.0  # m from a node, within which the shift changes from that of the node to that of the edge
+    spacing: Positive[float] = 10.0  # m between stations, at most
+    reach: NotNegative[float] = 80.0  # m; wiggles of the shift that are shorter are levelled
+    max_shift: NotNegative[float] = 5.0  # m
+    max_left: NotNegative[float] = 20.0  # m; fixes farther aside do not vote
+    prior_sigma: Positive[float] = 4.0  # m, by which the present course is expected to be off
+    vote_sigma: Positive[float] = 1.5  # m, least spread of votes about the middle, lanes included
+    min_traces: NotNegative[int] = 3  # on an edge; with fewer it stays
+    two_way_share: Share = 0.1  # of the votes that the rarer direction has on a road driven both ways
+    max_gap: NotNegative[float] = 6.0  # m between the two directions; an edge with more is two roads, and stays
+    fade: Positive[float] = 25.0  # m from a node, within which the shift of the node changes to that of the edge
     boundaries: bool = True  # whether road boundaries count, where the fleet has any
-    boundary_weight: float = 60.0  # votes that boundaries seen on both sides are worth
-    tolerance: float = 0.1  # m, by which the result is simplified
-
-    def __post_init__(self) -> None:
-        """Refuse negative numbers, and scales of zero."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            scale = field.name in ("spacing", "prior_sigma", "vote_sigma", "fade")
-            if value < 0 or (scale and value == 0) or value != value:
-                fix = f"use a number {'above 0' if scale else 'that is not negative'}"
-                raise OptionError(f"{field.name} is {value}", where="CentrelineOptions", fix=fix)
+    boundary_weight: NotNegative[float] = 60.0  # votes that boundaries seen on both sides are worth
+    tolerance: NotNegative[float] = 0.1  # m, by which the result is simplified
 
 
 def refine_centreline(

@@ -14,12 +14,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import betaln
 
+from probe2road.bounds import NotNegative, Positive, Probability
 from probe2road.crs import same_crs
-from probe2road.errors import CRSError, OptionError
+from probe2road.errors import CRSError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import FramedFixes, Traversals, edge_lines, frame, robust_sigma
 from probe2road.matching.match import Matches, turn_counts
+from probe2road.options import checked
 from probe2road.refinement.heights import HeightOptions, with_heights
 
 __all__ = ["EVIDENCE_COLUMNS", "EvidenceOptions", "add_evidence", "drive_numbers", "oneway_probabilities"]
@@ -43,30 +45,18 @@ _TURNED = ("yes", "-1", "no")
 
 
 @dataclass(frozen=True)
+@checked
 class EvidenceOptions:
     """What counts as having driven an edge, and how its properties are estimated."""
 
-    min_cover: float = 15.0  # m of an edge, or half of a shorter one, that a traversal has to cover
-    drive_pause: float = 300.0  # s; traces of one vehicle that follow each other sooner are one drive
-    min_confidence: float = 0.9  # probability from which oneway gets a value
-    wrong_way: float = 0.02  # share of traversals of a one-way road that are matched the wrong way
-    imbalance: float = 2.0  # a of Beta(a, a), the law of the share of one direction on two-way roads
-    oneway_share: float = 0.5  # of edges that are one-way, before anything was counted
-    max_interval: float = 60.0  # s; longer intervals between fixes do not count for the speed
+    min_cover: NotNegative[float] = 15.0  # m of an edge, or half of a shorter one, that a traversal has to cover
+    drive_pause: NotNegative[float] = 300.0  # s; traces of one vehicle that follow each other sooner are one drive
+    min_confidence: Probability = 0.9  # probability from which oneway gets a value
+    wrong_way: Probability = 0.02  # share of traversals of a one-way road that are matched the wrong way
+    imbalance: Positive[float] = 2.0  # a of Beta(a, a), the law of the share of one direction on two-way roads
+    oneway_share: Probability = 0.5  # of edges that are one-way, before anything was counted
+    max_interval: NotNegative[float] = 60.0  # s; longer intervals between fixes do not count for the speed
     heights: HeightOptions = field(default_factory=HeightOptions)  # how heights are estimated
-
-    def __post_init__(self) -> None:
-        """Refuse negative numbers, and probabilities that are none or certain."""
-        for name in ("min_cover", "drive_pause", "max_interval"):
-            if not getattr(self, name) >= 0:
-                fix = "use a number that is not negative"
-                raise OptionError(f"{name} is {getattr(self, name)}", where="EvidenceOptions", fix=fix)
-        for name in ("min_confidence", "wrong_way", "oneway_share"):
-            if not 0 < getattr(self, name) < 1:
-                fix = "use a number between 0 and 1"
-                raise OptionError(f"{name} is {getattr(self, name)}", where="EvidenceOptions", fix=fix)
-        if not self.imbalance > 0:
-            raise OptionError(f"imbalance is {self.imbalance}", where="EvidenceOptions", fix="use a positive number")
 
 
 def add_evidence(

@@ -10,7 +10,7 @@ are added.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative, Positive
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import (
@@ -31,6 +31,7 @@ from probe2road.matching.frame import (
     smooth_stations,
     stations_along,
 )
+from probe2road.options import checked
 
 __all__ = ["HeightOptions", "with_heights"]
 
@@ -39,25 +40,17 @@ _ROUNDS = 12  # of the alternation between profile and bias; the last ones move 
 
 
 @dataclass(frozen=True)
+@checked
 class HeightOptions:
     """How heights are estimated."""
 
-    spacing: float = 10.0  # m between the places at which heights are estimated
-    bias_length: float = 500.0  # m driven, over which a trace is wrong about its height by the same amount
-    bias_sigma: float = 4.0  # m, of that amount
-    sigma: float = 0.5  # m, of heights about it, at least; what is seen where that is more
-    reach: float = 100.0  # m; shorter humps are levelled
-    tolerance: float = 0.15  # m, by which the profile may be simplified
-    same_height: float = 1.5  # m; edge ends at a node that differ by less meet at one height
-
-    def __post_init__(self) -> None:
-        """Refuse negative numbers, and scales of zero."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            scale = field.name in ("spacing", "bias_length", "bias_sigma", "sigma")
-            if not value >= 0 or (scale and value == 0):
-                fix = f"use a number {'above 0' if scale else 'that is not negative'}"
-                raise OptionError(f"{field.name} is {value}", where="HeightOptions", fix=fix)
+    spacing: Positive[float] = 10.0  # m between the places at which heights are estimated
+    bias_length: Positive[float] = 500.0  # m driven, over which a trace is wrong about its height by the same amount
+    bias_sigma: Positive[float] = 4.0  # m, of that amount
+    sigma: Positive[float] = 0.5  # m, of heights about it, at least; what is seen where that is more
+    reach: NotNegative[float] = 100.0  # m; shorter humps are levelled
+    tolerance: NotNegative[float] = 0.15  # m, by which the profile may be simplified
+    same_height: NotNegative[float] = 1.5  # m; edge ends at a node that differ by less meet at one height
 
 
 def with_heights(

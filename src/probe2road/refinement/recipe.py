@@ -11,12 +11,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
-from probe2road.errors import OptionError
+from probe2road.bounds import Above, AtMost, NotNegative
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.match import Matches, MatchOptions, match
+from probe2road.options import checked
 from probe2road.refinement.centreline import CentrelineOptions, refine_centreline
 from probe2road.refinement.evidence import EvidenceOptions, add_evidence
 from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, fill_jumps, gap_weights, prune_gaps
@@ -35,14 +37,15 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
+@checked
 class RefineOptions:
     """How traces refine a graph."""
 
-    min_traces: int = 4  # traces that must drive through a filled gap for it to stay
-    gap_weight: float = 0.1  # of turning into a gap edge, where an edge of the segmentation has 1
+    min_traces: NotNegative[int] = 4  # traces that must drive through a filled gap for it to stay
+    gap_weight: Annotated[float, Above(0), AtMost(1)] = 0.1  # of turning into a gap edge; 1 for other edges
     gaps: GapOptions = field(default_factory=GapOptions)  # which gaps are filled
     matching: MatchOptions = field(default_factory=MatchOptions)  # how traces are matched
-    min_support: int | None = None  # traces that must drive on an edge for it to stay; 0 keeps all, None is as for move
+    min_support: NotNegative[int] | None = None  # traces on an edge that let it stay; 0 keeps all, None is as for move
     rungs: RungOptions = field(default_factory=RungOptions)  # which edges need more than min_support
     junctions: DisambiguateOptions = field(default_factory=DisambiguateOptions)  # which junctions are split
     braids: BraidOptions = field(default_factory=BraidOptions)  # which chains of edges are roads side by side
@@ -50,12 +53,6 @@ class RefineOptions:
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)  # what counts as having driven an edge
     move: bool | None = None  # whether edges move to the middle of what was driven; None: see `settled`
     centreline: CentrelineOptions = field(default_factory=CentrelineOptions)  # how far they may
-
-    def __post_init__(self) -> None:
-        """Refuse a gap weight that would make gaps as good as roads."""
-        if not 0 < self.gap_weight <= 1:
-            fix = "use a number above 0, up to 1"
-            raise OptionError(f"gap_weight is {self.gap_weight}", where="RefineOptions", fix=fix)
 
     def settled(self, *, learned: bool) -> RefineOptions:
         """Settle what is None by where the lines of the graph come from.

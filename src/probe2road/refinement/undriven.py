@@ -8,27 +8,23 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from probe2road.bounds import NotNegative
 from probe2road.errors import OptionError
 from probe2road.graph.clean import drop_edges
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.options import checked
 
 __all__ = ["RungOptions", "drop_undriven", "traces_per_edge"]
 
 
 @dataclass(frozen=True)
+@checked
 class RungOptions:
     """Which edges are rungs: short ones between two junctions, on which only errors of the matching put traces."""
 
-    max_length: float = 60.0  # m; longer edges are roads; 0 takes none for a rung
-    min_traces: int = 4  # traces that make a road of it
-    min_share: float = 0.3  # of the traces that pass at its quieter end, which make a road of it, too
-
-    def __post_init__(self) -> None:
-        """Refuse negative numbers."""
-        for name in ("max_length", "min_traces", "min_share"):
-            if not getattr(self, name) >= 0:
-                fault = f"{name} is {getattr(self, name)}"
-                raise OptionError(fault, where="RungOptions", fix="use a number that is not negative")
+    max_length: NotNegative[float] = 60.0  # m; longer edges are roads; 0 takes none for a rung
+    min_traces: NotNegative[int] = 4  # traces that make a road of it
+    min_share: NotNegative[float] = 0.3  # of the traces that pass at its quieter end, which make a road of it, too
 
 
 def drop_undriven(

@@ -29,8 +29,10 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from probe2road.bounds import Positive
 from probe2road.errors import OptionError
 from probe2road.fleet.contract import Fleet, TraceGaps
+from probe2road.options import checked
 from probe2road.raster.grid import Grid
 from probe2road.segmentation.bandwidth import estimate_bandwidth
 from probe2road.segmentation.segmenter import Segmenter
@@ -47,18 +49,14 @@ _WINDOW = 1024  # pixels; no influence on the result
 
 
 @dataclass(frozen=True)
+@checked
 class DensityOptions:
     """How density becomes probability."""
 
-    bandwidth: float | None = None  # m, Gaussian sigma; estimated from the data where None
-    half_evidence: float = 1.0  # traces on a ridge at which the probability is one half
-    half_presence: float = 0.3  # traces close by at which it is one half
-    half_ridge: float = 0.3  # relative curvature at which it is one half
-
-    def __post_init__(self) -> None:
-        """Refuse values that mean nothing."""
-        if self.bandwidth is not None and not self.bandwidth > 0:
-            raise OptionError(f"bandwidth is {self.bandwidth} m", where="DensityOptions", fix="use metres above 0")
+    bandwidth: Positive[float] | None = None  # m, Gaussian sigma; estimated from the data where None
+    half_evidence: Positive[float] = 1.0  # traces on a ridge at which the probability is one half
+    half_presence: Positive[float] = 0.3  # traces close by at which it is one half
+    half_ridge: Positive[float] = 0.3  # relative curvature at which it is one half
 
 
 def density_segmenter(

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
+from probe2road.bounds import AtLeast, Positive
 from probe2road.errors import OptionError, needs_extra
+from probe2road.options import checked
 
 with needs_extra("train", feature="the segmentation network in torch"):
     import torch
@@ -22,30 +25,25 @@ __all__ = ["ARCHITECTURES", "STRIDE", "Architecture", "DLinkNet", "find_architec
 
 STRIDE = 32  # pixels of the input that one pixel of the centre stands for
 
-_CENTRES = ("dilated", "transformer")
-
 
 @dataclass(frozen=True)
+@checked
 class Architecture:
     """What a network of the family looks like."""
 
-    blocks: tuple[int, int, int, int] = (3, 4, 6, 3)  # residual blocks of each encoder stage
-    width: int = 64  # channels of the stem, and of the first stage before expansion
+    blocks: tuple[Positive[int], Positive[int], Positive[int], Positive[int]] = (3, 4, 6, 3)  # residual blocks a stage
+    width: Annotated[int, AtLeast(8)] = 64  # channels of the stem, and of the first stage before expansion
     bottleneck: bool = False  # blocks of ResNet-50 (1x1, 3x3, 1x1 to four times the channels) instead of two 3x3
-    dilations: tuple[int, ...] = (1, 2, 4, 8)  # of the convolutions of the centre
-    centre_width: int | None = None  # channels of these convolutions, between two 1x1; those of the encoder where None
-    head_width: int = 32  # channels at full resolution
-    centre: str = "dilated"  # or "transformer": self-attention over all places instead of dilated convolutions
+    dilations: tuple[Positive[int], ...] = (1, 2, 4, 8)  # of the convolutions of the centre
+    centre_width: Positive[int] | None = None  # channels of these convolutions; those of the encoder where None
+    head_width: Positive[int] = 32  # channels at full resolution
+    centre: Literal["dilated", "transformer"] = "dilated"  # convolutions, or self-attention over all places
     attention: bool = False  # whether self-attention replaces the 3x3 convolutions of the last stage
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
-        if self.centre not in _CENTRES:
-            fix = f"use {' or '.join(_CENTRES)}"
-            raise OptionError(f"there is no centre {self.centre!r}", where="Architecture", fix=fix)
-        if len(self.blocks) != 4 or min(self.blocks) < 1 or self.width < 8 or self.width % 8:
-            fix = "use four numbers of blocks from 1, and a width that is a multiple of 8"
-            raise OptionError(f"blocks {self.blocks}, width {self.width}", where="Architecture", fix=fix)
+        if self.width % 8:
+            raise OptionError(f"width is {self.width}", where="Architecture", fix="use a multiple of 8")
 
     @property
     def features(self) -> tuple[int, int, int, int]:

@@ -20,9 +20,11 @@ from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import cast
+from typing import Literal
 
-from probe2road.errors import InputError, OptionError, needs_extra
+from probe2road.bounds import NotNegative, Positive, Probability
+from probe2road.errors import InputError, needs_extra
+from probe2road.options import checked
 from probe2road.segmentation.connectivity import Buffer, connectivity_weights
 from probe2road.vectorize.skeleton import Method
 
@@ -39,35 +41,20 @@ Loss = Callable[[Tensor, Tensor, int], Tensor]
 _XI, _ETA = 0.25, 0.5  # of the weight in the Dice term, METHOD 2.1; up to 0.5 the gradient on road is never positive
 _LIMIT = 1e4  # logits; far beyond what networks put out, and small enough to stay finite when squared and summed
 
-_CHOICES = {"kind": ("bce_dice", "cp"), "buffer": ("2x2", "3x3"), "thinning": ("zhang_suen", "guo_hall")}
-
 
 @dataclass(frozen=True)
+@checked
 class LossOptions:
     """What training minimises."""
 
-    kind: str = "cp"  # bce_dice, or cp: the connectivity-preserving loss
-    warm_up: int = 2000  # steps of BCE + Dice before CP-loss; some 30 epochs of the paper's tiles (METHOD 0.1 row 9)
-    sigma: float = 100.0  # px, reach of a wrong skeleton (METHOD 0.1 row 11)
-    buffer: str = "2x2"  # what a skeleton may deviate: 2x2 (the paper's, one-sided) or 3x3
-    thinning: str = "zhang_suen"  # how skeletons are made for CP-loss: zhang_suen (the source's) or guo_hall
-    threshold: float = 0.5  # probability from which a pixel is in the mask that is thinned
-    ce_weight: float = 1.0  # of the mean cross entropy beside the Dice term, in both losses
-    smooth: float = 1.0  # pixels added above and below the fraction of the Dice term
-
-    def __post_init__(self) -> None:
-        """Refuse values that mean nothing."""
-        for name, choices in _CHOICES.items():
-            if getattr(self, name) not in choices:
-                wrong = f"{name} is {getattr(self, name)!r}"
-                raise OptionError(wrong, where="LossOptions", fix=f"use one of {', '.join(choices)}")
-        for name in ("warm_up", "ce_weight", "smooth"):
-            if not getattr(self, name) >= 0:
-                raise OptionError(f"{name} is {getattr(self, name)}", where="LossOptions", fix="use 0 or more")
-        if not self.sigma > 0:
-            raise OptionError(f"sigma is {self.sigma} px", where="LossOptions", fix="use pixels above 0")
-        if not 0 < self.threshold < 1:
-            raise OptionError(f"threshold is {self.threshold}", where="LossOptions", fix="use a number between 0 and 1")
+    kind: Literal["bce_dice", "cp"] = "cp"  # bce_dice, or cp: the connectivity-preserving loss
+    warm_up: NotNegative[int] = 2000  # steps of BCE + Dice before CP-loss; 30 epochs of the paper (METHOD 0.1 row 9)
+    sigma: Positive[float] = 100.0  # px, reach of a wrong skeleton (METHOD 0.1 row 11)
+    buffer: Buffer = "2x2"  # what a skeleton may deviate: 2x2 (the paper's, one-sided) or 3x3
+    thinning: Method = "zhang_suen"  # how skeletons are made for CP-loss: zhang_suen (the source's) or guo_hall
+    threshold: Probability = 0.5  # probability from which a pixel is in the mask that is thinned
+    ce_weight: NotNegative[float] = 1.0  # of the mean cross entropy beside the Dice term, in both losses
+    smooth: NotNegative[float] = 1.0  # pixels added above and below the fraction of the Dice term
 
 
 def bce_dice(logits: Tensor, target: Tensor, *, ce_weight: float = 1.0, smooth: float = 1.0) -> Tensor:
@@ -211,8 +198,8 @@ def _weights(logits: Tensor, target: Tensor, options: LossOptions, pool: Executo
             prediction.flatten(0, -3).cpu().numpy(),
             (target > 0).flatten(0, -3).cpu().numpy(),
             sigma=options.sigma,
-            buffer=cast(Buffer, options.buffer),
-            thinning=cast(Method, options.thinning),
+            buffer=options.buffer,
+            thinning=options.thinning,
             pool=pool,
         )
     )

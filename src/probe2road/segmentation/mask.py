@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from probe2road.bounds import Probability
 from probe2road.errors import OptionError
+from probe2road.options import checked
 from probe2road.raster.grid import sparse_zeros
 from probe2road.segmentation.segmenter import Segmenter
 
@@ -20,21 +22,17 @@ _STRIP = 1024  # rows looked at together
 
 
 @dataclass(frozen=True)
+@checked
 class MaskOptions:
     """Which probability makes a road; where a threshold is None, the segmenter's own."""
 
-    threshold: float | None = None  # probability that continues a road
-    seed_threshold: float | None = None  # probability that starts one
+    threshold: Probability | None = None  # probability that continues a road
+    seed_threshold: Probability | None = None  # probability that starts one
 
     def __post_init__(self) -> None:
-        """Refuse what is no probability."""
-        for name in ("threshold", "seed_threshold"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < 1:
-                fix = "use a number between 0 and 1"
-                raise OptionError(f"{name} is {value}", where="MaskOptions", fix=fix)
+        """Refuse thresholds that are out of order."""
         if self.threshold is not None and self.seed_threshold is not None and self.threshold > self.seed_threshold:
-            fault = f"threshold {self.threshold} and seed_threshold {self.seed_threshold} are not in order"
+            fault = f"threshold is {self.threshold}, seed_threshold is {self.seed_threshold}"
             raise OptionError(fault, where="MaskOptions", fix="use threshold <= seed_threshold")
 
     def of(self, segmenter: Segmenter) -> tuple[float, float]:
@@ -48,7 +46,7 @@ class MaskOptions:
 
 
 def threshold_mask(
-    probability: NDArray[Any], *, threshold: float, seed_threshold: float | None = None
+    probability: NDArray[Any], *, threshold: float, seed_threshold: Probability | None = None
 ) -> NDArray[np.bool_]:
     """Return where the probability reaches a threshold, in parts that somewhere reach a higher one.
 

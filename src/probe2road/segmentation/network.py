@@ -6,12 +6,15 @@ import logging
 from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe2road.bounds import AtLeast, AtMost, OneOf, Positive
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import Fleet
+from probe2road.options import checked
 from probe2road.raster.counts import CHANNELS
 from probe2road.raster.grid import Grid
 from probe2road.segmentation.runtime import DEVICES, load_network, run_network
@@ -23,36 +26,20 @@ __all__ = ["NetworkOptions", "find_weights", "network_segmenter", "shipped_weigh
 logger = logging.getLogger(__name__)
 
 _STEPS = np.float32(2**16)  # of the probability between 0 and 1: fewer digits, which compress
-_LARGEST_OVERLAP = 0.9
-_RIGHT_ANGLES = 4
 _NO_NETWORK = 'use segmenter="density"'
 
 
 @dataclass(frozen=True)
+@checked
 class NetworkOptions:
     """Which network to run, and how."""
 
     weights: str | None = None  # file; the shipped one that suits the fleet where None
-    device: str = "cpu"  # or "cuda"
-    threads: int | None = None  # at most; all cores where None
-    tile: int | None = None  # px, side of the tiles that the network sees; the model's own where None
-    overlap: float = 0.5  # of neighbouring tiles, as a part of their side
-    turns: int = 1  # right angles that every tile is turned by, up to 4; the mean of what the network says is taken
-
-    def __post_init__(self) -> None:
-        """Refuse values that mean nothing."""
-        where = "NetworkOptions"
-        if self.device not in DEVICES:
-            raise OptionError(f"there is no device {self.device!r}", where=where, fix=f"use {' or '.join(DEVICES)}")
-        if not 0 <= self.overlap <= _LARGEST_OVERLAP:
-            fix = f"use 0 to {_LARGEST_OVERLAP}, 0.5 for half a tile"
-            raise OptionError(f"overlap is {self.overlap}", where=where, fix=fix)
-        if not 1 <= self.turns <= _RIGHT_ANGLES:
-            raise OptionError(f"turns is {self.turns}", where=where, fix=f"use 1 to {_RIGHT_ANGLES}")
-        for name in ("threads", "tile"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise OptionError(f"{name} is {value}", where=where, fix="use 1 or more")
+    device: Annotated[str, OneOf(*DEVICES)] = "cpu"  # or "cuda"
+    threads: Positive[int] | None = None  # at most; all cores where None
+    tile: Positive[int] | None = None  # px, side of the tiles that the network sees; the model's own where None
+    overlap: Annotated[float, AtLeast(0), AtMost(0.9)] = 0.5  # of neighbouring tiles, as a part of their side
+    turns: Annotated[int, AtLeast(1), AtMost(4)] = 1  # right angles that every tile is turned by; the mean counts
 
 
 def shipped_weights(*, points: bool) -> Path:

@@ -15,12 +15,14 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from probe2road.bounds import NotEmpty, Positive, Probability
 from probe2road.errors import InputError, OptionError
+from probe2road.options import checked
 
 __all__ = ["FORMAT", "ModelInfo", "Weights", "network_input", "pack_weights", "read_weights"]
 
@@ -35,38 +37,34 @@ _COPY = "copy the file again"
 
 
 @dataclass(frozen=True)
+@checked
 class ModelInfo:
     """What a network expects and promises, and where it comes from."""
 
     name: str  # of the model, for reports
-    channels: tuple[str, ...]  # what it looks at, in its order; names of probe2road.raster.counts.CHANNELS
+    channels: Annotated[tuple[str, ...], NotEmpty()]  # names of probe2road.raster.counts.CHANNELS, in its order
     network: dict[str, Any] = field(default_factory=dict)  # what the network is built from, for training
-    resolution: float = 1.0  # m per pixel
-    threshold: float = 0.5  # probability that continues a road
-    seed_threshold: float = 0.5  # probability that starts one
-    tile: int = 1024  # px, side of the tiles it is meant to see
-    stride: int = 32  # px; rows and columns of its input are multiples of it
+    resolution: Positive[float] = 1.0  # m per pixel
+    threshold: Probability = 0.5  # probability that continues a road
+    seed_threshold: Probability = 0.5  # probability that starts one
+    tile: Positive[int] = 1024  # px, side of the tiles it is meant to see
+    stride: Positive[int] = 32  # px; rows and columns of its input are multiples of it
     training: dict[str, Any] = field(default_factory=dict)  # configuration, seed, steps, data, scores
 
     def __post_init__(self) -> None:
         """Refuse what no network can mean."""
         where = f"model {self.name}"
-        if not self.channels or len(set(self.channels)) < len(self.channels):
+        if len(set(self.channels)) < len(self.channels):
             raise OptionError(f"channels are {list(self.channels)}", where=where, fix="name each one once")
-        if not self.resolution > 0:
-            raise OptionError(f"resolution is {self.resolution}", where=where, fix="use metres per pixel above 0")
-        if self.stride < 1 or self.tile < self.stride or self.tile % self.stride:
+        if self.tile % self.stride:
             raise OptionError(
                 f"a tile of {self.tile} px does not suit a stride of {self.stride} px",
                 where=where,
                 fix="use a multiple of the stride",
             )
-        if not 0 < self.threshold <= self.seed_threshold < 1:
-            raise OptionError(
-                f"threshold {self.threshold} and seed_threshold {self.seed_threshold} are not in order",
-                where=where,
-                fix="use 0 < threshold <= seed_threshold < 1",
-            )
+        if self.threshold > self.seed_threshold:
+            fault = f"threshold is {self.threshold}, seed_threshold is {self.seed_threshold}"
+            raise OptionError(fault, where=where, fix="use threshold <= seed_threshold")
 
 
 @dataclass(frozen=True)

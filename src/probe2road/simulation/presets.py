@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from probe2road.bounds import NotNegative, Positive
 from probe2road.errors import OptionError
-from probe2road.options import changed_by, read_toml
+from probe2road.options import changed_by, checked, read_toml
 from probe2road.simulation.driving.routes import DemandModel
 from probe2road.simulation.driving.speeds import DriverModel
 from probe2road.simulation.sensors.camera import CameraModel
@@ -22,29 +23,32 @@ __all__ = ["PRESETS", "Preset", "RecordingModel", "SurroundingsModel", "find_pre
 
 
 @dataclass(frozen=True)
+@checked
 class SurroundingsModel:
     """How much of the sky the surroundings hide: a factor on the rate of multipath bursts, by road class."""
 
-    exposure: Mapping[str, float] = field(
+    exposure: Mapping[str, NotNegative[float]] = field(
         default_factory=lambda: {"motorway": 0.2, "motorway_link": 0.3, "trunk": 0.5, "trunk_link": 0.6}
     )
-    other_exposure: float = 1.0  # on all other classes
-    spread: float = 0.8  # of the logarithm, from road section to road section: every drive is bad at the same places
+    other_exposure: NotNegative[float] = 1.0  # on all other classes
+    spread: NotNegative[float] = 0.8  # of the logarithm, between road sections: all drives are bad at the same places
 
 
 @dataclass(frozen=True)
+@checked
 class RecordingModel:
     """What a drive leaves in the data."""
 
-    pose_spacing: float = 2.5  # m between poses, and keyframes of the camera, of a moving vehicle
-    standing_interval: float = 1.0  # s between poses of a standing one
-    fix_interval: tuple[float, float] = (1.0, 30.0)  # s, range of a phone's interval, log-uniform over drives
-    drives_per_vehicle: int = 4  # consecutive drives that share a vehicle
+    pose_spacing: Positive[float] = 2.5  # m between poses, and keyframes of the camera, of a moving vehicle
+    standing_interval: Positive[float] = 1.0  # s between poses of a standing one
+    fix_interval: tuple[Positive[float], Positive[float]] = (1.0, 30.0)  # s, of a phone, log-uniform over drives
+    drives_per_vehicle: Positive[int] = 4  # consecutive drives that share a vehicle
     first_day: str = "2024-03-04T00:00:00Z"  # the fleet records from here on
-    days: float = 28.0  # for so long
+    days: Positive[float] = 28.0  # for so long
 
 
 @dataclass(frozen=True)
+@checked
 class Preset:
     """Everything that the simulator knows about one kind of fleet."""
 

@@ -7,21 +7,22 @@ label of a thinned sample is what enough of the remaining drives passed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.benchmark.sets.tiles import TILE_SIZE
-from probe2road.errors import OptionError
+from probe2road.bounds import AtLeast, NotEmpty, NotNegative, Positive, Share
+from probe2road.options import checked
 from probe2road.raster.counts import count_pixels
 from probe2road.raster.lines import draw_lines
 from probe2road.training.scene import Scene, rows_around
 
 __all__ = ["Sample", "SampleOptions", "Vectors", "draw_sample", "sample_vectors", "square", "square_vectors"]
 
-_ROTATIONS = ("none", "right_angles", "any")
 # Places to columns and rows, turned by no, one, two and three right angles.
 _TURNS = np.array([[[1, 0], [0, -1]], [[0, 1], [1, 0]], [[-1, 0], [0, 1]], [[0, -1], [-1, 0]]], np.float64)
 _SEGMENT = 150.0  # m; a longer step is no segment (`probe2road.fleet.contract.TraceGaps.max_step`)
@@ -31,36 +32,23 @@ _FAST = 40.0  # m/s; with sparse fixes a segment may be as long as what is drive
 
 
 @dataclass(frozen=True)
+@checked
 class SampleOptions:
     """What a sample is, and how it is varied."""
 
-    size: int = 384  # pixels of 1 m
-    min_drives: int = 4  # distinct drives that make an edge a label; the N of the paper
-    label_width: int = 3  # pixels
-    rotation: str = "any"  # one of "none", "right_angles", "any"
+    size: Annotated[int, AtLeast(32)] = 384  # pixels of 1 m
+    min_drives: NotNegative[int] = 4  # distinct drives that make an edge a label; the N of the paper
+    label_width: Positive[int] = 3  # pixels
+    rotation: Literal["none", "right_angles", "any"] = "any"  # what samples are turned by
     flip: bool = True  # whether half of the samples are mirrored
-    busy_share: float = 0.5  # of the samples, centred near junctions and crossings
-    jitter: float = 0.3  # of the size, by which a centre lies beside the road
+    busy_share: Share = 0.5  # of the samples, centred near junctions and crossings
+    jitter: Share = 0.3  # of the size, by which a centre lies beside the road
     tiles: bool = False  # whether centres are those of the tiles of the benchmark, each as likely, instead
-    all_drives_share: float = 0.4  # of the samples, with all drives
-    least_drives: float = 0.05  # share of the drives that the thinnest sample keeps
-    intervals: tuple[float, ...] = (0.0,)  # s between fixes, one is drawn; 0 keeps all
-    offsets: tuple[float, ...] = (0.0,)  # m, 1 sigma of a shift of each drive, one is drawn; traces and points alike
-    least_points: float = 0.3  # share of the semantic points that the poorest sample keeps
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be drawn."""
-        if self.rotation not in _ROTATIONS:
-            fix = f"use one of {', '.join(_ROTATIONS)}"
-            raise OptionError(f"there is no rotation {self.rotation!r}", where="SampleOptions", fix=fix)
-        shares = ("busy_share", "jitter", "all_drives_share", "least_drives", "least_points")
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            if entry.name in shares and not 0 <= value <= 1:
-                raise OptionError(f"{entry.name} is {value}", where="SampleOptions", fix="use 0 to 1")
-        if self.size < 32 or self.label_width < 1 or not self.intervals or not self.offsets:
-            fix = "use a size from 32, a label width from 1, and at least one interval and one offset"
-            raise OptionError("a sample cannot be drawn", where="SampleOptions", fix=fix)
+    all_drives_share: Share = 0.4  # of the samples, with all drives
+    least_drives: Share = 0.05  # share of the drives that the thinnest sample keeps
+    intervals: Annotated[tuple[NotNegative[float], ...], NotEmpty()] = (0.0,)  # s between fixes, one drawn; 0 keeps all
+    offsets: Annotated[tuple[NotNegative[float], ...], NotEmpty()] = (0.0,)  # m, 1 sigma of a drive's shift, one drawn
+    least_points: Share = 0.3  # share of the semantic points that the poorest sample keeps
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
@@ -16,11 +17,13 @@ from probe2road.benchmark.sets.prepare import read_tiles
 from probe2road.benchmark.sets.recording import POSES, Recording
 from probe2road.benchmark.sets.reference import labelled_reference
 from probe2road.benchmark.sets.tiles import split_area
+from probe2road.bounds import NotNegative, OneOf
 from probe2road.errors import InputError, OptionError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet, read_fleet_files
 from probe2road.io.graph_files import read_graph
 from probe2road.matching.labels import LabelOptions, label_pieces
+from probe2road.options import checked
 from probe2road.training.scene import Scene, load_scene, make_scene, save_scene
 
 __all__ = ["Source", "driven_reference", "members", "open_scene"]
@@ -31,25 +34,23 @@ _SCENES = "scenes"  # folder of the laid-out scenes, beside the data sets
 
 
 @dataclass(frozen=True)
+@checked
 class Source:
     """Fleet data and the roads it was recorded on: either a data set of the benchmark, or files."""
 
     name: str = "columbus"  # of a data set or a group of the benchmark, or what to call your own
     split: str = ""  # of the data set; all of it where empty
-    data: str = "modelled"  # of a data set: one of POSES
+    data: Annotated[str, OneOf(*POSES)] = "modelled"  # of a data set: one of POSES
     fleet: str = ""  # fleet data of your own, read by `probe2road.read_fleet`
     points: str = ""  # its semantic points, where they are another file
     reference: str = ""  # centrelines of your own, a graph file
-    weight: float = 1.0  # how often it is drawn, against the other sources
+    weight: NotNegative[float] = 1.0  # how often it is drawn, against the other sources
 
     def __post_init__(self) -> None:
         """Refuse a source of nothing, or of two things."""
         if self.name == "" or bool(self.fleet) != bool(self.reference):
             fix = "give the name of a data set, or a name, a fleet and a reference"
             raise OptionError("names nothing to learn from", where="source", fix=fix)
-        if self.data not in POSES or self.weight < 0:
-            fix = f"use {', '.join(POSES)}, and a weight of 0 or more"
-            raise OptionError(f"data is {self.data!r}, weight is {self.weight}", where=f"source {self.name}", fix=fix)
 
 
 def members(sources: Sequence[Source]) -> list[Source]:

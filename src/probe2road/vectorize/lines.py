@@ -21,9 +21,11 @@ import shapely
 from numba import njit
 from numpy.typing import NDArray
 
-from probe2road.errors import InputError, OptionError
+from probe2road.bounds import NotNegative
+from probe2road.errors import InputError
 from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.graph.tables import empty_turns, finish_edges
+from probe2road.options import checked
 from probe2road.raster.counts import Grid
 from probe2road.vectorize.skeleton import skeleton_pixels
 from probe2road.vectorize.tracing import PixelGraph, trace_pixels
@@ -36,17 +38,12 @@ _HALF_DIAGONAL = 0.5**0.5  # px; farthest that smoothing moves a vertex
 
 
 @dataclass(frozen=True)
+@checked
 class VectorizeOptions:
     """How pixel lines become road geometry."""
 
-    smoothing: float = 2.0  # m, standard deviation of the smoothing along the line; 0 switches it off
-    simplify_tolerance: float = 1.0  # m, Douglas-Peucker; 0 keeps every vertex
-
-    def __post_init__(self) -> None:
-        """Refuse negative lengths."""
-        for name in ("smoothing", "simplify_tolerance"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise OptionError(f"{name} is {getattr(self, name)}", where="vectorize", fix="use 0 m or more")
+    smoothing: NotNegative[float] = 2.0  # m, standard deviation of the smoothing along the line; 0 switches it off
+    simplify_tolerance: NotNegative[float] = 1.0  # m, Douglas-Peucker; 0 keeps every vertex
 
 
 def vectorize(

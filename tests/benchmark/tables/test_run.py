@@ -103,7 +103,7 @@ def test_what_cannot_be_run_is_said_at_once(sets, tmp_path):
         find_methods(["magic"])
     with pytest.raises(OptionError, match="DeepMG has no weights"):
         find_methods(["deepmg"])
-    with pytest.raises(OptionError, match="no poses 'perfect'"):
+    with pytest.raises(OptionError, match="poses is 'perfect'"):
         Source(sets / NAME, tmp_path, "perfect")
     with pytest.raises(InputError, match=r"boston: there is no manifest.json"):
         run_benchmark(sets, tmp_path / "out", names=["boston"])

@@ -153,7 +153,7 @@ class TestShape:
         assert filled.turns.to_numpy().tolist() == [[3, 1, 1, 9]]
 
     def test_bad_options(self) -> None:
-        with pytest.raises(OptionError, match=r"max_length is -1.0; use a number that is not negative"):
+        with pytest.raises(OptionError, match=r"max_length is -1.0; use a number of at least 0"):
             GapOptions(max_length=-1.0)
         with pytest.raises(OptionError, match="heading_length"):
             GapOptions(heading_length=0.0)

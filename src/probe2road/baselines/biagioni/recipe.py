@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,11 @@ from probe2road.baselines.biagioni.gray_skeleton import gray_skeleton
 from probe2road.baselines.biagioni.pruning import prune_segments
 from probe2road.baselines.biagioni.street_map import initial_map, straight_pieces
 from probe2road.baselines.biagioni.traversals import Observations, Runs, good_runs, match_pieces, observe_trips
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative, OneOf, Positive
 from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.models import PublishedModel
+from probe2road.options import checked
 from probe2road.raster.counts import fleet_grid
 from probe2road.raster.grid import Grid
 from probe2road.run.progress import Progress, silent
@@ -37,31 +39,22 @@ SIGMAS = {"code": (2.9, 8.0), "paper": (8.5, 26.0)}  # m: of the Gaussian, and w
 
 
 @dataclass(frozen=True)
+@checked
 class BiagioniOptions:
     """The parameters of METHOD 4.7; the defaults are those of the published program."""
 
-    resolution: float = 1.0  # m per cell
-    sigma: str = "code"  # which Gaussian blurs the lines: one of SIGMAS
+    resolution: Positive[float] = 1.0  # m per cell
+    sigma: Annotated[str, OneOf(*SIGMAS)] = "code"  # which Gaussian blurs the lines: one of SIGMAS
     gaps: TraceGaps = field(default_factory=TraceGaps)  # where trips are broken
-    closing: float = 8.0  # m, radius of the disk that closes the density
-    simplify_tolerance: float = 10.0  # m, Douglas-Peucker
+    closing: NotNegative[float] = 8.0  # m, radius of the disk that closes the density
+    simplify_tolerance: NotNegative[float] = 10.0  # m, Douglas-Peucker
     matcher: PublishedModel = field(default=PublishedModel())  # its step is the spacing of the observations
-    blackout: float = 30.0  # s around an observation without a road that are left out
-    run_error: float = 10.0  # m, largest root mean square distance of a good run from its segment
-    min_runs: int = 2  # good runs that keep a segment
+    blackout: NotNegative[float] = 30.0  # s around an observation without a road that are left out
+    run_error: NotNegative[float] = 10.0  # m, largest root mean square distance of a good run from its segment
+    min_runs: NotNegative[int] = 2  # good runs that keep a segment
     last_runs: bool = False  # whether the last run of a trip counts; the published program loses it
-    collapse_length: float = 50.0  # m, longest segment that is tried
-    collapse_error: float = 12.0  # m, largest root mean square distance of a run after a collapse
-
-    def __post_init__(self) -> None:
-        """Refuse an unknown sigma, and lengths that are none."""
-        if self.sigma not in SIGMAS:
-            raise OptionError(f"there is no sigma {self.sigma!r}", where="Biagioni", fix=f"use {' or '.join(SIGMAS)}")
-        if not self.resolution > 0:
-            raise OptionError(f"resolution is {self.resolution}", where="Biagioni", fix="use metres above 0")
-        for name in ("closing", "simplify_tolerance", "blackout", "run_error", "collapse_length", "collapse_error"):
-            if not getattr(self, name) >= 0:
-                raise OptionError(f"{name} is {getattr(self, name)}", where="Biagioni", fix="use 0 or more")
+    collapse_length: NotNegative[float] = 50.0  # m, longest segment that is tried
+    collapse_error: NotNegative[float] = 12.0  # m, largest root mean square distance of a run after a collapse
 
 
 # For fleet data whose traces lie within a metre or two: carriageways stay apart, bends are not cut, and drives of few

@@ -17,8 +17,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.baselines.deepmg.variants import Variant
+from probe2road.bounds import NotNegative, Positive
 from probe2road.errors import OptionError
 from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
+from probe2road.options import checked
 from probe2road.raster.grid import Grid
 
 __all__ = ["COARSE_CELLS", "PLANES", "FeatureOptions", "Steps", "extract_features", "thin_traces"]
@@ -36,19 +38,20 @@ _BYTE = 256
 
 
 @dataclass(frozen=True)
+@checked
 class FeatureOptions:
     """What a network was trained to see."""
 
-    resolution: float = 2.0  # m, side of a cell; the published 1.95 m, rounded
-    spacing: float = 10.0  # m, least distance of fixes that are kept
-    min_step: float = 5.0  # m; shorter steps say nothing about the road
-    max_step: float = 300.0  # m; longer steps say nothing either
+    resolution: Positive[float] = 2.0  # m, side of a cell; the published 1.95 m, rounded
+    spacing: NotNegative[float] = 10.0  # m, least distance of fixes that are kept
+    min_step: NotNegative[float] = 5.0  # m; shorter steps say nothing about the road
+    max_step: NotNegative[float] = 300.0  # m; longer steps say nothing either
 
     def __post_init__(self) -> None:
         """Refuse lengths that are out of order."""
-        if not (self.resolution > 0 and self.spacing >= 0 and 0 <= self.min_step < self.max_step):
-            fix = "use a positive resolution, a spacing of 0 or more, and min_step < max_step"
-            raise OptionError(f"{self} makes no sense", where="FeatureOptions", fix=fix)
+        if self.min_step >= self.max_step:
+            fault = f"min_step is {self.min_step}, max_step is {self.max_step}"
+            raise OptionError(fault, where="FeatureOptions", fix="use min_step < max_step")
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ plain values; which of them become edges is decided in `probe2road.baselines.dee
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +19,10 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.baselines.deepmg.variants import Variant
+from probe2road.bounds import Positive
 from probe2road.crs import WGS84, transform
-from probe2road.errors import OptionError
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.options import checked
 
 __all__ = ["NO_NODE", "Link", "LinkOptions", "angle_stretch", "bearing_difference", "propose_links"]
 
@@ -31,21 +32,15 @@ _Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+@checked
 class LinkOptions:
     """Which links are proposed."""
 
-    radius: float = 50.0  # m; longer links are never made
-    snap: float = 15.0  # m; a hit this near to a vertex of the polyline goes to that vertex
-    stub: float = 15.0  # m; an edge with two dead ends that is shorter has no direction of its own
-    max_turn: float = 90.0  # degrees, between a road and its link to a node that its extension misses
-    min_angle: float = 20.0  # degrees; of two links from one place that differ by less, the shorter is made
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that are not positive."""
-        for field in fields(self):
-            if not getattr(self, field.name) > 0:
-                fault = f"{field.name} is {getattr(self, field.name)}"
-                raise OptionError(fault, where="LinkOptions", fix="use a positive number")
+    radius: Positive[float] = 50.0  # m; longer links are never made
+    snap: Positive[float] = 15.0  # m; a hit this near to a vertex of the polyline goes to that vertex
+    stub: Positive[float] = 15.0  # m; an edge with two dead ends that is shorter has no direction of its own
+    max_turn: Positive[float] = 90.0  # degrees, between a road and its link to a node that its extension misses
+    min_angle: Positive[float] = 20.0  # degrees; of two links from one place that differ by less, the shorter is made
 
 
 class Link(NamedTuple):

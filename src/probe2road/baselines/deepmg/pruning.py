@@ -9,9 +9,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import empty_turns, finish_edges
+from probe2road.options import checked
 
 __all__ = ["PruneOptions", "prune_graph"]
 
@@ -19,17 +20,13 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
+@checked
 class PruneOptions:
     """How often a direction of an edge has to be driven."""
 
-    min_drives: int = 1  # traversals of an edge of the mask
-    min_link_drives: int = 5  # traversals of a link
-    max_links: int = 2  # links at a node; the shortest are kept
-
-    def __post_init__(self) -> None:
-        """Refuse negative numbers."""
-        if min(self.min_drives, self.min_link_drives, self.max_links) < 0:
-            raise OptionError(f"{self} has a negative number", where="PruneOptions", fix="use numbers from 0 on")
+    min_drives: NotNegative[int] = 1  # traversals of an edge of the mask
+    min_link_drives: NotNegative[int] = 5  # traversals of a link
+    max_links: NotNegative[int] = 2  # links at a node; the shortest are kept
 
 
 def prune_graph(graph: RoadGraph, traversals: NDArray[np.int64], options: PruneOptions | None = None) -> RoadGraph:

@@ -6,6 +6,7 @@ import hashlib
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +17,12 @@ from probe2road.baselines.deepmg.links import LinkOptions
 from probe2road.baselines.deepmg.mask_graph import mask_graph
 from probe2road.baselines.deepmg.pruning import PruneOptions, prune_graph
 from probe2road.baselines.deepmg.traversals import MatcherOptions, count_traversals
-from probe2road.baselines.deepmg.variants import find_variant
+from probe2road.baselines.deepmg.variants import VARIANTS, find_variant
+from probe2road.bounds import OneOf, Probability
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.options import checked
 from probe2road.raster.counts import fleet_grid
 from probe2road.raster.grid import Grid
 from probe2road.run.progress import Progress, silent
@@ -33,23 +36,17 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
+@checked
 class DeepMGOptions:
     """Everything that decides which graph comes out."""
 
     weights: str = ""  # file of a trained network; it also says what the network was trained to see
-    variant: str = "fixed"  # or as_published; has to be that of the weights
-    threshold: float = 0.5  # probability from which a cell is a centreline
+    variant: Annotated[str, OneOf(*VARIANTS)] = "fixed"  # has to be that of the weights
+    threshold: Probability = 0.5  # probability from which a cell is a centreline
     gaps: TraceGaps = field(default_factory=TraceGaps)  # where traces are broken
     links: LinkOptions = field(default_factory=LinkOptions)  # how roads are linked across interruptions
     matcher: MatcherOptions = field(default_factory=MatcherOptions)  # how traces are matched
     prune: PruneOptions = field(default_factory=PruneOptions)  # how often edges have to be driven
-
-    def __post_init__(self) -> None:
-        """Refuse unknown variants and thresholds that are no probability."""
-        find_variant(self.variant)
-        if not 0 < self.threshold < 1:
-            fix = "use a probability between 0 and 1"
-            raise OptionError(f"threshold is {self.threshold}", where="DeepMGOptions", fix=fix)
 
 
 @dataclass(frozen=True)

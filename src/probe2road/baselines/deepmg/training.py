@@ -15,8 +15,10 @@ from probe2road.baselines.deepmg.prediction import save_network
 from probe2road.baselines.deepmg.t2rnet import T2RNet, t2rnet_loss
 from probe2road.baselines.deepmg.tiles import Batch, TileSet, read_batch
 from probe2road.baselines.deepmg.variants import find_variant
+from probe2road.bounds import NotNegative, Positive
 from probe2road.errors import InputError, OptionError, needs_extra
 from probe2road.io.atomic import atomic_path
+from probe2road.options import checked
 
 with needs_extra("train", feature="training DeepMG"):
     import torch
@@ -32,24 +34,18 @@ _VALIDATION_BATCH = 8  # tiles at a time
 
 
 @dataclass(frozen=True)
+@checked
 class TrainOptions:
     """How T2RNet is trained; the defaults are the published settings."""
 
-    width: int = 64  # channels of the first stage
-    epochs: int = 200
-    learning_rate: float = 2e-4
-    halve_every: int = 10  # epochs after which the learning rate is halved
-    validate_every: int = 20  # training steps
-    seed: int = 2017  # of the weights at the start and of the order of the tiles
+    width: Positive[int] = 64  # channels of the first stage
+    epochs: Positive[int] = 200
+    learning_rate: Positive[float] = 2e-4
+    halve_every: Positive[int] = 10  # epochs after which the learning rate is halved
+    validate_every: Positive[int] = 20  # training steps
+    seed: NotNegative[int] = 2017  # of the weights at the start and of the order of the tiles
     device: str = "cpu"
     bfloat16: bool = False  # whether convolutions run in half precision; faster where the processor has it
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that train nothing."""
-        for name in ("width", "epochs", "learning_rate", "halve_every", "validate_every"):
-            if not getattr(self, name) > 0:
-                fix = "use a positive number"
-                raise OptionError(f"{name} is {getattr(self, name)}", where="TrainOptions", fix=fix)
 
 
 @dataclass

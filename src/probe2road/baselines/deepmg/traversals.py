@@ -16,7 +16,7 @@ has cost a factor of e^-100.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,11 +24,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.baselines.deepmg.features import Steps
-from probe2road.errors import OptionError
+from probe2road.bounds import Positive
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.candidates import Scratch, nearest_points, new_scratch
 from probe2road.matching.network import Follow, States, build_follow, build_states
 from probe2road.matching.routes import Labels, new_labels, search
+from probe2road.options import checked
 
 __all__ = ["MatcherOptions", "count_traversals"]
 
@@ -36,20 +37,14 @@ _REACH, _REACH_FACTOR = 200.0, 4.0  # m, and times the straight line: bound of t
 
 
 @dataclass(frozen=True)
+@checked
 class MatcherOptions:
     """The matcher's numbers, as published."""
 
-    radius: float = 50.0  # m, within which edges are candidates
-    sigma: float = 50.0  # m, standard deviation of fixes
-    beta: float = 2.0  # m, mean difference of route and straight line
-    link_factor: float = 1.4  # by which links are longer for a route
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that are no scale."""
-        for field in fields(self):
-            if not getattr(self, field.name) > 0:
-                fault = f"{field.name} is {getattr(self, field.name)}"
-                raise OptionError(fault, where="MatcherOptions", fix="use a positive number")
+    radius: Positive[float] = 50.0  # m, within which edges are candidates
+    sigma: Positive[float] = 50.0  # m, standard deviation of fixes
+    beta: Positive[float] = 2.0  # m, mean difference of route and straight line
+    link_factor: Positive[float] = 1.4  # by which links are longer for a route
 
 
 class _Model(NamedTuple):

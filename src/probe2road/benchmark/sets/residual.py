@@ -18,7 +18,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative, Positive
+from probe2road.options import checked
 
 __all__ = ["ResidualModel", "align_drives"]
 
@@ -29,6 +30,7 @@ _PLACE_WAVES, _DRIVE_WAVES = 64, 24  # waves in a sum; more are closer to a norm
 
 
 @dataclass(frozen=True)
+@checked
 class ResidualModel:
     """How far aligned poses are from the truth; one sigma each.
 
@@ -39,23 +41,14 @@ class ResidualModel:
     are chosen: a few hundred metres are what odometry of 0.2 % carries to within these errors.
     """
 
-    place_sigma: float = 0.7  # m, east and north each, the same for all drives at a place
-    place_height_sigma: float = 0.8  # m, up, likewise
-    place_length: float = 1000.0  # m, scale over which the error of the place varies
-    lateral_sigma: float = 0.2  # m, across the road, of each drive for itself
-    longitudinal_sigma: float = 0.6  # m, along the road, likewise
-    height_sigma: float = 0.15  # m, up, likewise
-    heading_sigma: float = 0.1  # degrees, likewise
-    drive_length: float = 250.0  # m, scale over which the error of a drive varies
-
-    def __post_init__(self) -> None:
-        """Refuse negative sizes and scales without length."""
-        for name in ("place_length", "drive_length"):
-            if not getattr(self, name) > 0:
-                raise OptionError(f"{name} is {getattr(self, name)}", where="ResidualModel", fix="use metres above 0")
-        for name, value in vars(self).items():
-            if not value >= 0:
-                raise OptionError(f"{name} is {value}", where="ResidualModel", fix="use 0 or more")
+    place_sigma: NotNegative[float] = 0.7  # m, east and north each, the same for all drives at a place
+    place_height_sigma: NotNegative[float] = 0.8  # m, up, likewise
+    place_length: Positive[float] = 1000.0  # m, scale over which the error of the place varies
+    lateral_sigma: NotNegative[float] = 0.2  # m, across the road, of each drive for itself
+    longitudinal_sigma: NotNegative[float] = 0.6  # m, along the road, likewise
+    height_sigma: NotNegative[float] = 0.15  # m, up, likewise
+    heading_sigma: NotNegative[float] = 0.1  # degrees, likewise
+    drive_length: Positive[float] = 250.0  # m, scale over which the error of a drive varies
 
     @property
     def accuracy(self) -> float:

@@ -7,6 +7,7 @@ import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
@@ -20,12 +21,14 @@ from probe2road.benchmark.sets.prepare import check_dataset, read_tiles
 from probe2road.benchmark.sets.recording import POSES, Recording
 from probe2road.benchmark.sets.reference import labelled_reference
 from probe2road.benchmark.sets.tiles import SPLITS, split_area
-from probe2road.errors import InputError, OptionError
+from probe2road.bounds import NotNegative, OneOf, Positive
+from probe2road.errors import InputError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet_files
 from probe2road.io.fleet_writer import write_fleet
 from probe2road.io.graph_files import read_graph
+from probe2road.options import checked
 
 __all__ = ["Source", "choose_drives", "make_fleet"]
 
@@ -35,19 +38,15 @@ _SEED = 64
 
 
 @dataclass(frozen=True)
+@checked
 class Source:
     """A prepared data set, which of its fleets and roads are taken, and where the work on it is kept."""
 
     folder: Path
     work: Path
-    poses: str = "aligned"  # one of POSES
-    drives: int | None = None  # of each road at most, roughly; all where None
-    min_drives: int = 4  # of the whole fleet, that a road of the reference has
-
-    def __post_init__(self) -> None:
-        """Refuse unknown poses."""
-        if self.poses not in POSES:
-            raise OptionError(f"there are no poses {self.poses!r}", where="benchmark", fix=f"use {', '.join(POSES)}")
+    poses: Annotated[str, OneOf(*POSES)] = "aligned"  # one of POSES
+    drives: Positive[int] | None = None  # of each road at most, roughly; all where None
+    min_drives: NotNegative[int] = 4  # of the whole fleet, that a road of the reference has
 
     @property
     def name(self) -> str:

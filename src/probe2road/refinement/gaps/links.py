@@ -16,8 +16,9 @@ import shapely
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative, Positive
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.options import checked
 
 __all__ = [
     "NO_NODE",
@@ -43,30 +44,21 @@ _TOUCH = 0.05  # m; a link is not tested for crossings nearer than this to its e
 
 
 @dataclass(frozen=True)
+@checked
 class GapOptions:
     """Which gaps are filled (METHOD 3.6, 0.1 rows 16 to 18)."""
 
-    max_length: float = 50.0  # m; longer links are never made
-    snap: float = 15.0  # m; a hit this near to the end of its edge goes to the node there
-    beside: float = 20.0  # m; a dead end is led into an edge that runs along it this near; 0 switches that off
-    max_turn: float = 90.0  # degrees, between road and link, at both ends of a link between dead ends
-    min_angle: float = 20.0  # degrees; of two links at one node that differ by less, the shorter is made
-    heading_length: float = 15.0  # m, over which the direction of a dead end is measured
-    max_links: int = 2  # links at one node
-    stem_turn: float = 20.0  # degrees, at both ends of a link between junctions that face each other; 0: no such links
-    max_jump: float = 100.0  # m, between edge ends that are joined because traces jump from one to the other; 0: none
-    min_jumps: int = 2  # traces that must
-    jump_turn: float = 60.0  # degrees, between road and link, at both of its ends
-
-    def __post_init__(self) -> None:
-        """Refuse negative numbers."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not value >= 0:
-                fix = "use a number that is not negative"
-                raise OptionError(f"{field.name} is {value}", where="GapOptions", fix=fix)
-        if not self.heading_length > 0:
-            raise OptionError("heading_length is 0", where="GapOptions", fix="use a positive number")
+    max_length: NotNegative[float] = 50.0  # m; longer links are never made
+    snap: NotNegative[float] = 15.0  # m; a hit this near to the end of its edge goes to the node there
+    beside: NotNegative[float] = 20.0  # m; a dead end is led into an edge that runs along it this near; 0 leaves it
+    max_turn: NotNegative[float] = 90.0  # degrees, between road and link, at both ends of a link between dead ends
+    min_angle: NotNegative[float] = 20.0  # degrees; of two links at one node that differ by less, the shorter is made
+    heading_length: Positive[float] = 15.0  # m, over which the direction of a dead end is measured
+    max_links: NotNegative[int] = 2  # links at one node
+    stem_turn: NotNegative[float] = 20.0  # degrees, at both ends of a link between junctions face to face; 0: none
+    max_jump: NotNegative[float] = 100.0  # m, between edge ends that are joined because traces jump across; 0: none
+    min_jumps: NotNegative[int] = 2  # traces that must
+    jump_turn: NotNegative[float] = 60.0  # degrees, between road and link, at both of its ends
 
 
 @dataclass(frozen=True)

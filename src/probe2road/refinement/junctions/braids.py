@@ -28,12 +28,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative
 from probe2road.graph.clean import merge_degree_two_nodes
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.splitting import led_to
 from probe2road.graph.tables import finish_edges
 from probe2road.graph.topology import directions_away, end_nodes
+from probe2road.options import checked
 from probe2road.refinement.junctions.passages import step_rows
 
 __all__ = ["BraidOptions", "open_braids"]
@@ -49,22 +50,16 @@ _BESIDE = (15.0, 40.0)  # m from a chain between which the distance of its roads
 
 
 @dataclass(frozen=True)
+@checked
 class BraidOptions:
     """Which chains of short edges are taken for roads side by side."""
 
-    max_inner: float = 100.0  # m; longer edges between two joints are roads of their own; 0 opens nothing
-    max_shared: float = 300.0  # m; the same for edges that are driven in both directions
-    max_angle: float = 30.0  # degrees between an edge at a joint and the line that all edges there lie along
-    max_width: float = 16.0  # m between the outermost lines of a chain, and between the roads that lead to it
-    min_traces: int = 3  # that drive in, and out, by the edges that lead to a chain
-    min_share: float = 0.85  # of the traces on such an edge that drive in its direction
-
-    def __post_init__(self) -> None:
-        """Refuse negative numbers."""
-        for name, value in vars(self).items():
-            if not value >= 0:
-                fix = "use a number that is not negative"
-                raise OptionError(f"{name} is {value}", where="BraidOptions", fix=fix)
+    max_inner: NotNegative[float] = 100.0  # m; longer edges between two joints are roads of their own; 0 opens nothing
+    max_shared: NotNegative[float] = 300.0  # m; the same for edges that are driven in both directions
+    max_angle: NotNegative[float] = 30.0  # degrees between an edge at a joint and the line of all edges there
+    max_width: NotNegative[float] = 16.0  # m between the outermost lines of a chain, and between roads that lead to it
+    min_traces: NotNegative[int] = 3  # that drive in, and out, by the edges that lead to a chain
+    min_share: NotNegative[float] = 0.85  # of the traces on such an edge that drive in its direction
 
 
 @dataclass(frozen=True)

@@ -29,13 +29,14 @@ import shapely
 from numpy.typing import NDArray
 from shapely.ops import substring
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import finish_edges
 from probe2road.graph.topology import directions_away, end_nodes
 from probe2road.matching.frame import FramedFixes, Traversals, frame
 from probe2road.matching.match import Matches
+from probe2road.options import checked
 
 __all__ = ["ForkOptions", "Forks", "find_forks", "move_forks"]
 
@@ -56,24 +57,18 @@ _LANE_GAIN = 0.5  # of the squared errors of one rise, what must be left with tw
 
 
 @dataclass(frozen=True)
+@checked
 class ForkOptions:
     """Which forks are moved, and how far."""
 
-    reach: float = 120.0  # m along the common road, farthest that a fork is moved; 0 moves none
-    max_angle: float = 35.0  # degrees between the two branches of a fork
-    min_traces: int = 3  # traces that each branch needs at a place
-    min_rise: float = 1.5  # m by which traces must have drawn apart where the fork was
-    confidence: float = 3.0  # standard errors by which the rise must differ from none
-    min_lane: float = 2.5  # m, of a lane that traces change to before they part
-    max_lane: float = 4.5  # m; a rise that is higher is none to another lane
-    rejoin: float = 12.0  # m behind the old place where the branches are as before
-
-    def __post_init__(self) -> None:
-        """Refuse negative numbers."""
-        for name in vars(self):
-            if not getattr(self, name) >= 0:
-                fault = f"{name} is {getattr(self, name)}"
-                raise OptionError(fault, where="ForkOptions", fix="use a number that is not negative")
+    reach: NotNegative[float] = 120.0  # m along the common road, farthest that a fork is moved; 0 moves none
+    max_angle: NotNegative[float] = 35.0  # degrees between the two branches of a fork
+    min_traces: NotNegative[int] = 3  # traces that each branch needs at a place
+    min_rise: NotNegative[float] = 1.5  # m by which traces must have drawn apart where the fork was
+    confidence: NotNegative[float] = 3.0  # standard errors by which the rise must differ from none
+    min_lane: NotNegative[float] = 2.5  # m, of a lane that traces change to before they part
+    max_lane: NotNegative[float] = 4.5  # m; a rise that is higher is none to another lane
+    rejoin: NotNegative[float] = 12.0  # m behind the old place where the branches are as before
 
 
 @dataclass(frozen=True)

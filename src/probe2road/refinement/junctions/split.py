@@ -13,16 +13,18 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative, OneOf
 from probe2road.graph.clean import merge_degree_two_nodes
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import TURN_DTYPES
+from probe2road.options import checked
 from probe2road.refinement.junctions.groups import (
     GroupingRules,
     connected_ends,
@@ -50,27 +52,18 @@ _SURE = 1.5  # times the usual confidence, where height alone tells an artefact 
 
 
 @dataclass(frozen=True)
+@checked
 class DisambiguateOptions:
     """When edges that meet at a junction are taken for unconnected."""
 
-    variant: str = "guarded"  # one of VARIANTS
-    min_count: int = 4  # passages from which two edge ends are connected (METHOD 0.1 row 23)
-    min_share: float = 0.05  # of the less driven end's passages that a pair must have; below are matching errors
-    max_inner: float = 60.0  # m; shorter edges between two junctions may be artefacts of a crossing; 0 trusts all
-    min_apart: float = 3.0  # m between the traces of two roads at both nodes of an artefact; on one road they coincide
-    min_height: float = 4.0  # m between traces on stacked roads
-    confidence: float = 2.0  # standard errors by which a height difference must differ from none
+    variant: Annotated[str, OneOf(*VARIANTS)] = "guarded"
+    min_count: NotNegative[int] = 4  # passages from which two edge ends are connected (METHOD 0.1 row 23)
+    min_share: NotNegative[float] = 0.05  # of the less driven end's passages that a pair must have; fewer are errors
+    max_inner: NotNegative[float] = 60.0  # m; shorter edges between junctions may be artefacts; 0 trusts all
+    min_apart: NotNegative[float] = 3.0  # m between traces at both nodes of an artefact; on one road they coincide
+    min_height: NotNegative[float] = 4.0  # m between traces on stacked roads
+    confidence: NotNegative[float] = 2.0  # standard errors by which a height difference must differ from none
     merge: bool = True  # whether nodes of degree 2 are merged afterwards
-
-    def __post_init__(self) -> None:
-        """Refuse an unknown variant and negative numbers."""
-        if self.variant not in VARIANTS:
-            fault = f"variant is {self.variant!r}"
-            raise OptionError(fault, where="DisambiguateOptions", fix=f"use {' or '.join(VARIANTS)}")
-        for name in ("min_count", "min_share", "max_inner", "min_apart", "min_height", "confidence"):
-            if not getattr(self, name) >= 0:
-                fault = f"{name} is {getattr(self, name)}"
-                raise OptionError(fault, where="DisambiguateOptions", fix="use a number that is not negative")
 
 
 def split_false_junctions(

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from probe2road.errors import InputError, OptionError
+from probe2road.bounds import NotNegative, Positive
+from probe2road.errors import InputError
+from probe2road.options import checked
 from probe2road.simulation.networks.network import RoadNetwork
 
 __all__ = ["DemandModel", "LinkGraph", "draw_route", "link_graph", "route_moves"]
@@ -26,6 +28,7 @@ _ATTEMPTS = 50  # origins tried before giving up: an origin may reach no destina
 
 
 @dataclass(frozen=True)
+@checked
 class DemandModel:
     """How many drives begin and end where, and how drivers choose their way.
 
@@ -34,8 +37,8 @@ class DemandModel:
     production-constrained gravity model).
     """
 
-    zipf_exponent: float = 1.0  # of the weight over the rank; Zipf's law of places is 1
-    class_weight: Mapping[str, float] = field(
+    zipf_exponent: Positive[float] = 1.0  # of the weight over the rank; Zipf's law of places is 1
+    class_weight: Mapping[str, NotNegative[float]] = field(
         default_factory=lambda: {  # annual average daily traffic over that of a secondary road
             "motorway": 12.0,
             "trunk": 5.0,
@@ -43,18 +46,12 @@ class DemandModel:
             "secondary": 1.0,
         }
     )
-    other_weight: float = 0.4  # for all other classes
-    inner_share: float = 0.05  # weight of a link inside the network over one that enters or leaves it
-    mean_trip_time: float = 900.0  # s, scale of the exponential deterrence
-    min_trip_time: float = 60.0  # s
-    cost_spread: float = 0.25  # standard deviation of the natural logarithm of a driver's perceived link times
-    turn_time: float = 4.0  # s, perceived cost of a turn sharper than 40 degrees
-
-    def __post_init__(self) -> None:
-        """Refuse demands that cannot be drawn."""
-        for name in ("mean_trip_time", "zipf_exponent"):
-            if not getattr(self, name) > 0:
-                raise OptionError(f"{name} is {getattr(self, name)}", where="DemandModel", fix="use a positive number")
+    other_weight: NotNegative[float] = 0.4  # for all other classes
+    inner_share: NotNegative[float] = 0.05  # weight of a link inside the network over one that enters or leaves it
+    mean_trip_time: Positive[float] = 900.0  # s, scale of the exponential deterrence
+    min_trip_time: NotNegative[float] = 60.0  # s
+    cost_spread: NotNegative[float] = 0.25  # of perceived link times: standard deviation of their natural logarithm
+    turn_time: NotNegative[float] = 4.0  # s, perceived cost of a turn sharper than 40 degrees
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative, Positive, Share
+from probe2road.options import checked
 
 __all__ = ["DriverModel", "Journey", "drive_along", "lane_wander"]
 
@@ -17,34 +18,29 @@ _CRAWL = 0.8  # m/s; the slowest that a moving vehicle goes, so that time stays 
 
 
 @dataclass(frozen=True)
+@checked
 class DriverModel:
     """How people drive."""
 
-    speed_bias: float = 1.0  # chosen speed over the limit, median over drivers
-    speed_spread: float = 0.08  # between drivers, standard deviation of the logarithm
-    flow_spread: float = 0.12  # along the road, standard deviation of the logarithm
-    flow_length: float = 2000.0  # m over which the flow of traffic changes
-    jam_share: float = 0.05  # of the road that is congested
-    jam_speed: float = 0.35  # speed there over the free speed
-    lateral_acceleration: float = 2.5  # m/s2 accepted in curves
-    acceleration: float = 1.3  # m/s2
-    deceleration: float = 1.8  # m/s2
-    yield_stop: float = 0.7  # probability of a stop where the vehicle gives way
-    yield_wait: float = 4.0  # s, mean of the exponential wait there
-    signal_stop: float = 0.25  # probability of a stop at another junction at grade
-    signal_wait: float = 18.0  # s, mean of the exponential wait there
-    lane_bias: float = 0.36  # m, between vehicles: standard deviation of the place held in the lane
-    wander_sigma: float = 0.22  # m, of the slow weaving of one vehicle
-    wander_rate: float = 0.85  # 1/s, of the critically damped process that weaves
-    lane_change_time: float = 6.3  # s, mean
-    lane_change_spread: float = 2.0  # s, standard deviation
-    preference_length: float = 3000.0  # m over which a driver's preferred lane lasts
-
-    def __post_init__(self) -> None:
-        """Refuse drivers that never arrive."""
-        for name in ("speed_bias", "acceleration", "deceleration", "lateral_acceleration", "flow_length", "jam_speed"):
-            if not getattr(self, name) > 0:
-                raise OptionError(f"{name} is {getattr(self, name)}", where="DriverModel", fix="use a positive number")
+    speed_bias: Positive[float] = 1.0  # chosen speed over the limit, median over drivers
+    speed_spread: NotNegative[float] = 0.08  # between drivers, standard deviation of the logarithm
+    flow_spread: NotNegative[float] = 0.12  # along the road, standard deviation of the logarithm
+    flow_length: Positive[float] = 2000.0  # m over which the flow of traffic changes
+    jam_share: Share = 0.05  # of the road that is congested
+    jam_speed: Positive[float] = 0.35  # speed there over the free speed
+    lateral_acceleration: Positive[float] = 2.5  # m/s2 accepted in curves
+    acceleration: Positive[float] = 1.3  # m/s2
+    deceleration: Positive[float] = 1.8  # m/s2
+    yield_stop: Share = 0.7  # probability of a stop where the vehicle gives way
+    yield_wait: NotNegative[float] = 4.0  # s, mean of the exponential wait there
+    signal_stop: Share = 0.25  # probability of a stop at another junction at grade
+    signal_wait: NotNegative[float] = 18.0  # s, mean of the exponential wait there
+    lane_bias: NotNegative[float] = 0.36  # m, between vehicles: standard deviation of the place held in the lane
+    wander_sigma: NotNegative[float] = 0.22  # m, of the slow weaving of one vehicle
+    wander_rate: Positive[float] = 0.85  # 1/s, of the critically damped process that weaves
+    lane_change_time: Positive[float] = 6.3  # s, mean
+    lane_change_spread: NotNegative[float] = 2.0  # s, standard deviation
+    preference_length: Positive[float] = 3000.0  # m over which a driver's preferred lane lasts
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from probe2road.bounds import NotNegative, Positive
+from probe2road.options import checked
 from probe2road.simulation.networks.network import RoadNetwork
 from probe2road.simulation.networks.road_classes import CLASS_DEFAULTS
 
@@ -18,20 +20,21 @@ _THROUGH = 60.0  # degrees; the grade continues from one section to the next whe
 
 
 @dataclass(frozen=True)
+@checked
 class HeightOptions:
     """What a height profile must keep, and how smooth it is."""
 
-    clearance: float = 5.5  # m, from road surface to road surface
-    margin: float = 0.05  # m, solved for on top of the clearance
-    terrain_relief: float = 12.0  # m, standard deviation of the terrain
-    terrain_scale: float = 2500.0  # m, its shortest wavelength
-    smoothing: float = 70.0  # m, over which a disturbance fades into the terrain
-    grade_tolerance: float = 0.005  # rise over run by which a grade may pass its limit before it is listed
-    vertical_radius: float = 400.0  # m; a grade changes at most this fast: 1 / radius for each metre
-    least_radius: float = 300.0  # m; a sharper vertical curve is listed
-    lift: float = 30.0  # weight of the terrain below which an open road is kept from sinking, relative to rising
-    max_steps: int = 60  # Newton steps
-    raised_pull: float = 0.05  # weight of the terrain under bridges and tunnels, relative to open road
+    clearance: NotNegative[float] = 5.5  # m, from road surface to road surface
+    margin: NotNegative[float] = 0.05  # m, solved for on top of the clearance
+    terrain_relief: NotNegative[float] = 12.0  # m, standard deviation of the terrain
+    terrain_scale: Positive[float] = 2500.0  # m, its shortest wavelength
+    smoothing: Positive[float] = 70.0  # m, over which a disturbance fades into the terrain
+    grade_tolerance: NotNegative[float] = 0.005  # rise over run by which a grade may pass its limit before it is listed
+    vertical_radius: Positive[float] = 400.0  # m; a grade changes at most this fast: 1 / radius for each metre
+    least_radius: NotNegative[float] = 300.0  # m; a sharper vertical curve is listed
+    lift: NotNegative[float] = 30.0  # weight of the terrain against sinking below it, relative to rising, on open road
+    max_steps: Positive[int] = 60  # Newton steps
+    raised_pull: NotNegative[float] = 0.05  # weight of the terrain under bridges and tunnels, relative to open road
 
 
 def vertex_unknowns(network: RoadNetwork, offsets: NDArray[np.int64]) -> NDArray[np.int64]:

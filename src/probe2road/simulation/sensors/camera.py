@@ -14,13 +14,15 @@ puts them where the vehicle believes to be.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from probe2road.bounds import Above, AtLeast, Below, NotNegative, Positive
 from probe2road.errors import OptionError
+from probe2road.options import checked
 
 __all__ = ["CameraModel", "Detections", "FeatureIndex", "feature_index", "see"]
 
@@ -33,44 +35,44 @@ _OCCLUDERS = 3  # the vehicle ahead, and one in the lane to either side
 
 
 @dataclass(frozen=True)
+@checked
 class CameraModel:
     """A forward mono camera and its detector."""
 
-    near: float  # m, range at which the road comes into view above the bonnet
-    far: float  # m, range beyond which lines are not reported
-    half_angle: float  # degrees, half the horizontal field of view
-    height: float  # m above the road
-    pixel: float  # radians, angle of one pixel
-    pixel_noise: float  # pixels, 1 sigma, of a point's place in the image
-    lateral_noise: float  # m, 1 sigma, width of a painted line and its segmentation
-    boundary_noise: float  # the same for boundaries, as a multiple
-    height_noise: float  # m, 1 sigma of a point
-    pitch_noise: float  # degrees, 1 sigma, of the keyframe; shared by its points
-    pitch_time: float  # s, its time constant
-    yaw_bias: float  # degrees, 1 sigma over vehicles: mounting
-    dash_points: float  # expected points on a dash beside the vehicle's own lane, in one pass with a clear view
-    solid_points: float  # on a metre of solid line: fewer than on a metre of dash, because ends are what is tracked
-    boundary_points: float  # on a metre of boundary
-    range_decay: float  # m, over which detection falls by e beyond the near range
-    lane_reach: float  # m of lateral distance up to which markings are reported fully, those of the own lane
-    lane_decay: float  # m, sigma of the fall beyond
-    boundary_reach: float  # m, the same for boundaries
-    boundary_decay: float  # m
-    boundary_found: float  # m, mean length of road over which a boundary is followed
-    boundary_lost: float  # m, mean length over which it is not
-    outage_every: float  # m, mean distance between dropouts of the whole camera (glare, wiper, wet road)
-    outage_length: float  # m, mean
-    traffic_share: float  # of the road on which an occluding vehicle is near, each of three places
-    traffic_length: float  # m, mean length over which it stays
-    false_rate: float  # false points a metre driven
-    altitude_gate: float  # m of height difference beyond which a line is on another road
-    altitude_slope: float  # further allowance per metre of range
+    near: NotNegative[float]  # m, range at which the road comes into view above the bonnet
+    far: Positive[float]  # m, range beyond which lines are not reported
+    half_angle: Annotated[float, Above(0), Below(90)]  # degrees, half the horizontal field of view
+    height: Positive[float]  # m above the road
+    pixel: Positive[float]  # radians, angle of one pixel
+    pixel_noise: NotNegative[float]  # pixels, 1 sigma, of a point's place in the image
+    lateral_noise: NotNegative[float]  # m, 1 sigma, width of a painted line and its segmentation
+    boundary_noise: NotNegative[float]  # the same for boundaries, as a multiple
+    height_noise: NotNegative[float]  # m, 1 sigma of a point
+    pitch_noise: NotNegative[float]  # degrees, 1 sigma, of the keyframe; shared by its points
+    pitch_time: Positive[float]  # s, its time constant
+    yaw_bias: NotNegative[float]  # degrees, 1 sigma over vehicles: mounting
+    dash_points: NotNegative[float]  # expected points on a dash beside the own lane, in one pass with a clear view
+    solid_points: NotNegative[float]  # on a metre of solid line: fewer than of dash, because ends are what is tracked
+    boundary_points: NotNegative[float]  # on a metre of boundary
+    range_decay: Positive[float]  # m, over which detection falls by e beyond the near range
+    lane_reach: NotNegative[float]  # m to the side up to which markings are reported fully, those of the own lane
+    lane_decay: Positive[float]  # m, sigma of the fall beyond
+    boundary_reach: NotNegative[float]  # m, the same for boundaries
+    boundary_decay: Positive[float]  # m
+    boundary_found: Positive[float]  # m, mean length of road over which a boundary is followed
+    boundary_lost: NotNegative[float]  # m, mean length over which it is not
+    outage_every: Positive[float]  # m, mean distance between dropouts of the whole camera (glare, wiper, wet road)
+    outage_length: NotNegative[float]  # m, mean
+    traffic_share: Annotated[float, AtLeast(0), Below(1)]  # of the road with an occluding vehicle, each of three places
+    traffic_length: Positive[float]  # m, mean length over which it stays
+    false_rate: NotNegative[float]  # false points a metre driven
+    altitude_gate: NotNegative[float]  # m of height difference beyond which a line is on another road
+    altitude_slope: NotNegative[float]  # further allowance per metre of range
 
     def __post_init__(self) -> None:
         """Refuse cameras that see nothing."""
-        if not 0 <= self.near < self.far or not 0 < self.half_angle < 90:
-            fix = "use 0 <= near < far and a half angle within 0 to 90 degrees"
-            raise OptionError(f"field of view {self.near} to {self.far} m", where="CameraModel", fix=fix)
+        if self.near >= self.far:
+            raise OptionError(f"near is {self.near}, far is {self.far}", where="CameraModel", fix="use near < far")
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative, Positive
+from probe2road.options import checked
 
 __all__ = ["GnssErrors", "GnssModel", "gnss_errors"]
 
@@ -26,28 +27,23 @@ _AWARENESS = 0.5  # share of a burst, on a logarithmic scale, that the receiver 
 
 
 @dataclass(frozen=True)
+@checked
 class GnssModel:
     """Error statistics of a single-point GNSS solution, each horizontal axis alike."""
 
-    slow_sigma: float  # m, of the slow Gauss-Markov process
-    slow_time: float  # s, its time constant
-    fast_sigma: float  # m, of the fast Gauss-Markov process
-    fast_time: float  # s
-    white_sigma: float  # m, from fix to fix
-    burst_rate: float  # bursts a second where the exposure is 1
-    burst_duration: float  # s, mean (exponential)
-    burst_median: float  # m, median of the log-normal scale of a burst
-    burst_spread: float  # standard deviation of the natural logarithm of that scale
-    burst_time: float  # s, time constant of the error inside a burst
-    burst_white: float  # white part of the error inside a burst, as a share of its scale
-    vertical_ratio: float  # vertical error over the error of one horizontal axis, outside bursts
-    burst_vertical_ratio: float  # and inside
-
-    def __post_init__(self) -> None:
-        """Refuse times that are not positive and sizes that are negative."""
-        for name, value in vars(self).items():
-            if not np.isfinite(value) or value < 0 or (value == 0 and name.endswith(("_time", "duration"))):
-                raise OptionError(f"{name} is {value}", where="GnssModel", fix="use a positive number")
+    slow_sigma: NotNegative[float]  # m, of the slow Gauss-Markov process
+    slow_time: Positive[float]  # s, its time constant
+    fast_sigma: NotNegative[float]  # m, of the fast Gauss-Markov process
+    fast_time: Positive[float]  # s
+    white_sigma: NotNegative[float]  # m, from fix to fix
+    burst_rate: NotNegative[float]  # bursts a second where the exposure is 1
+    burst_duration: Positive[float]  # s, mean (exponential)
+    burst_median: NotNegative[float]  # m, median of the log-normal scale of a burst
+    burst_spread: NotNegative[float]  # standard deviation of the natural logarithm of that scale
+    burst_time: Positive[float]  # s, time constant of the error inside a burst
+    burst_white: NotNegative[float]  # white part of the error inside a burst, as a share of its scale
+    vertical_ratio: NotNegative[float]  # vertical error over the error of one horizontal axis, outside bursts
+    burst_vertical_ratio: NotNegative[float]  # and inside
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from probe2road.errors import OptionError
+from probe2road.bounds import NotNegative, Positive, Share
+from probe2road.options import checked
 from probe2road.simulation.driving.traffic import TruePoses
 from probe2road.simulation.sensors.gnss import GnssErrors
 
@@ -27,33 +28,29 @@ __all__ = ["FusedPoses", "FusionModel", "OdometryModel", "fuse"]
 
 
 @dataclass(frozen=True)
+@checked
 class OdometryModel:
     """Errors of wheel and inertial odometry that calibration on the road leaves."""
 
-    scale_sigma: float  # of the distance driven, constant over a drive
-    heading_sigma: float  # degrees, of the heading error while GNSS is there
-    heading_time: float  # s, its time constant
-    gyro_bias: float  # degrees/s, constant over a drive; turns the heading while GNSS is away
-    gyro_walk: float  # degrees per square root of a second, while GNSS is away
-    height_walk: float  # m per square root of a metre driven
+    scale_sigma: NotNegative[float]  # of the distance driven, constant over a drive
+    heading_sigma: NotNegative[float]  # degrees, of the heading error while GNSS is there
+    heading_time: Positive[float]  # s, its time constant
+    gyro_bias: NotNegative[float]  # degrees/s, constant over a drive; turns the heading while GNSS is away
+    gyro_walk: NotNegative[float]  # degrees per square root of a second, while GNSS is away
+    height_walk: NotNegative[float]  # m per square root of a metre driven
 
 
 @dataclass(frozen=True)
+@checked
 class FusionModel:
     """How GNSS and odometry become one pose."""
 
-    pull_time: float  # s, time constant with which good GNSS pulls the horizontal error
-    vertical_pull_time: float  # s, the same for the height
-    gate: float  # m, a longer innovation counts as this long
-    trusted_sigma: float  # m, GNSS whose standard deviation is larger pulls less, by the square of the ratio
-    min_trust: float  # least share of the pull that poor GNSS keeps
-    vehicle_bias: float  # m, each axis: antenna and mounting, constant over all drives of a vehicle
-
-    def __post_init__(self) -> None:
-        """Refuse filters that divide by zero."""
-        for name in ("pull_time", "vertical_pull_time", "gate", "trusted_sigma"):
-            if not getattr(self, name) > 0:
-                raise OptionError(f"{name} is {getattr(self, name)}", where="FusionModel", fix="use a positive number")
+    pull_time: Positive[float]  # s, time constant with which good GNSS pulls the horizontal error
+    vertical_pull_time: Positive[float]  # s, the same for the height
+    gate: Positive[float]  # m, a longer innovation counts as this long
+    trusted_sigma: Positive[float]  # m, GNSS whose standard deviation is larger pulls less, by the square of the ratio
+    min_trust: Share  # least share of the pull that poor GNSS keeps
+    vehicle_bias: NotNegative[float]  # m, each axis: antenna and mounting, constant over all drives of a vehicle
 
 
 @dataclass(frozen=True)
