@@ -23,6 +23,7 @@ __all__ = [
     "local_crs",
     "parse_crs",
     "require_metric",
+    "require_same_crs",
     "same_crs",
     "transform",
     "turn_headings",
@@ -168,6 +169,38 @@ def same_crs(first: CRS, second: CRS) -> bool:
     False
     """
     return bool(first == second or first.to_2d().equals(second.to_2d(), ignore_axis_order=True))
+
+
+def require_same_crs(
+    first: CRS, second: CRS, *, where: str, what: tuple[str, str] = ("the traces are", "the graph is")
+) -> None:
+    """Refuse data in two CRS.
+
+    Parameters
+    ----------
+    first, second
+        The two CRS, compared as `same_crs` does.
+    where
+        Who asks, for the message.
+    what
+        What has the one and what the other, with its verb.
+
+    Raises
+    ------
+    CRSError
+        If coordinates do not mean the same in both.
+
+    Examples
+    --------
+    >>> require_same_crs(CRS.from_epsg(32616), CRS.from_epsg(32617), where="match")
+    Traceback (most recent call last):
+        ...
+    probe2road.errors.CRSError: match: the traces are in WGS 84 / UTM zone 16N, the graph is in WGS 84 / UTM zone 17N;
+    reproject one of them, for example with to_crs
+    """
+    if not same_crs(first, second):
+        fault = f"{what[0]} in {first.name}, {what[1]} in {second.name}"
+        raise CRSError(fault, where=where, fix="reproject one of them, for example with to_crs")
 
 
 def transform(x: ArrayLike, y: ArrayLike, source: CRS, target: CRS) -> tuple[Any, Any]:

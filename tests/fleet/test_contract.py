@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import logging
+import pickle
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -212,3 +214,23 @@ def test_headings_turn_with_the_north_of_the_crs():
     other = fleet.to_crs("EPSG:32633")
     assert other.traces["heading"].iloc[0] > 90.0
     assert other.to_crs("EPSG:32632").traces["heading"].to_numpy() == pytest.approx(fleet.traces["heading"], abs=1e-3)
+
+
+def test_fixes_know_their_trace_and_traces_their_id() -> None:
+    fleet = fleet_from_tables(drives(trace_id=["b", "b", "b", "a", "a"]), crs=UTM)
+    assert fleet.owner.tolist() == [0, 0, 1, 1, 1]
+    assert fleet.ids.tolist() == ["a", "b"]
+    assert fleet.ids.dtype == fleet.traces["trace_id"].dtype
+    assert fleet.owner is fleet.owner
+    with pytest.raises(ValueError, match="read-only"):
+        fleet.owner[0] = 1
+
+
+def test_what_was_found_in_a_fleet_does_not_travel_with_it() -> None:
+    fleet = fleet_from_tables(drives(), crs=UTM)
+    assert len(fleet.owner) == len(fleet.traces) == 5
+    fewer = replace(fleet, traces=fleet.traces.iloc[3:].reset_index(drop=True))
+    assert (fewer.owner.tolist(), fewer.ids.tolist()) == ([0, 0], [2])
+    empty = replace(fleet, traces=fleet.traces.iloc[:0])
+    assert (empty.owner.tolist(), empty.ids.tolist()) == ([], [])
+    assert set(vars(pickle.loads(pickle.dumps(fleet)))) == {"traces", "points", "crs"}

@@ -133,13 +133,12 @@ def add_drives(
         If a trace id is in both fleets.
     """
     new = new if new.crs == aligned.crs else new.to_crs(aligned.crs)
-    known = aligned.traces["trace_id"].iloc[aligned.starts[:-1]]
-    double = np.intersect1d(known.to_numpy(), new.traces["trace_id"].to_numpy()[new.starts[:-1]])
+    double = np.intersect1d(aligned.ids.to_numpy(), new.ids.to_numpy())
     if len(double):
         fault = f"{len(double)} trace ids are in both fleets ({', '.join(map(str, double[:3]))})"
         raise InputError(fault, where="add_drives", fix="give new drives ids of their own")
     joined = _joined(aligned, new)
-    held = joined.traces["trace_id"].iloc[joined.starts[:-1]].isin(known).to_numpy()
+    held = joined.ids.isin(aligned.ids)
     return _align(joined, held, options or AlignOptions(), workspace, workers, progress)
 
 
@@ -157,9 +156,8 @@ def _align(
         raise OptionError(f"workers is {workers}", where="align", fix="use 1 or more")
     reasons = np.where(held, "", screen_drives(fleet))
     usable = reasons == ""
-    owner = np.repeat(np.arange(fleet.n_traces), np.diff(fleet.starts))
-    touched = (usable & ~held)[owner]
-    steady = np.zeros((len(owner), 4))
+    touched = (usable & ~held)[fleet.owner]
+    steady = np.zeros((len(touched), 4))
     steady[touched, :2] = steadying(fleet)[touched]
     fleet = moved_fleet(fleet, steady)
     tiles = find_tiles(fleet, options, touched=touched if held.any() else None)

@@ -121,7 +121,7 @@ def keyframes(fleet: Fleet, options: AlignOptions) -> Keyframes:
     >>> frames.distance.tolist(), frames.motion[1].tolist()
     ([0.0, 50.0, 100.0], [50.0, 0.0, 0.0])
     """
-    traces, starts = fleet.traces, fleet.starts
+    traces = fleet.traces
     xy = traces[["x", "y"]].to_numpy(np.float64)
     breaks = trace_breaks(fleet)
     theta = fixes_course(fleet, breaks)
@@ -140,9 +140,8 @@ def keyframes(fleet: Fleet, options: AlignOptions) -> Keyframes:
     pose = np.column_stack([xy[row], theta[row]])
     motion, sigma = _motions(pose, distance[row], reckoned, unseen, row, chain[row], options)
     accuracy = traces["accuracy"].to_numpy(np.float64) if "accuracy" in traces else np.full(len(traces), np.nan)
-    drive = np.repeat(np.arange(fleet.n_traces), np.diff(starts))
     return Keyframes(
-        row, drive[row], chain[row], distance[row], pose, traces["z"].to_numpy(np.float64)[row],
+        row, fleet.owner[row], chain[row], distance[row], pose, traces["z"].to_numpy(np.float64)[row],
         np.where(accuracy > 0, accuracy, options.gnss_sigma)[row], motion, sigma, distance,
     )  # fmt: skip
 

@@ -123,19 +123,17 @@ def steadying(fleet: Fleet) -> NDArray[np.float64]:
     >>> steadying(fleet)[29:32].tolist()
     [[0.0, 0.0], [0.0, -40.0], [0.0, 0.0]]
     """
-    starts = fleet.starts
     breaks = np.zeros(len(fleet.traces), bool)
-    breaks[starts[:-1]] = True
+    breaks[fleet.starts[:-1]] = True
     steps = reckoned_steps(fleet, fixes_course(fleet, trace_breaks(fleet)), breaks)
     interval = fix_intervals(fleet.traces["t"])
     with np.errstate(invalid="ignore"):
         breaks |= ~(np.isfinite(steps).all(axis=1) & (interval <= _BRIDGED))
     steps[breaks] = 0.0
-    owner = np.repeat(np.arange(fleet.n_traces), np.diff(starts))
     xy = fleet.traces[["x", "y"]].to_numpy(np.float64)
     seconds = np.cumsum(np.where(breaks, 0.0, interval))
     chain = np.cumsum(breaks) - 1
-    path = np.cumsum(_fitted(xy, steps, seconds, chain, owner), axis=0)
+    path = np.cumsum(_fitted(xy, steps, seconds, chain, fleet.owner), axis=0)
     error = xy - path
     return _running_median(error, seconds, chain) - error
 

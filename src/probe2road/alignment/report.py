@@ -85,14 +85,12 @@ def make_report(fleet: Fleet, reasons: NDArray[np.str_], held: NDArray[np.bool_]
     moves
         What alignment did.
     """
-    starts = fleet.starts
-    owner = np.repeat(np.arange(fleet.n_traces), np.diff(starts))
-    points = np.bincount(owner, weights=moves.sights, minlength=fleet.n_traces).astype(np.int64)
-    moved = pd.Series(np.hypot(moves.shift[:, 0], moves.shift[:, 1])).groupby(owner).median()
+    points = np.bincount(fleet.owner, weights=moves.sights, minlength=fleet.n_traces).astype(np.int64)
+    moved = pd.Series(np.hypot(moves.shift[:, 0], moves.shift[:, 1])).groupby(fleet.owner).median()
     status = np.select([reasons != "", held, points > 0], ["rejected", "held", "aligned"], "by path")
     drives = pd.DataFrame(
         {
-            "trace_id": fleet.traces["trace_id"].to_numpy()[starts[:-1]],
+            "trace_id": fleet.ids,
             "status": status,
             "reason": reasons,
             "points": points,

@@ -53,7 +53,7 @@ def screen_drives(fleet: Fleet) -> NDArray[np.str_]:
     ['does not move', '']
     """
     traces, starts = fleet.traces, fleet.starts
-    owner = np.repeat(np.arange(fleet.n_traces), np.diff(starts))
+    owner = fleet.owner
     dx, dy = (np.diff(traces[axis].to_numpy(), prepend=np.nan) for axis in "xy")
     step = np.hypot(dx, dy)
     step[starts[:-1]] = np.nan
@@ -88,11 +88,10 @@ def rows_of_points(fleet: Fleet) -> NDArray[np.int64]:
     ndarray of int64, shape (n_points,)
         -1 where the drive has no fix within 0.6 s, or none with a clock.
     """
-    traces, points, starts = fleet.traces, fleet.points, fleet.starts
+    traces, points = fleet.traces, fleet.points
     if points.empty:
         return np.zeros(0, np.int64)
-    ids = pd.Index(traces["trace_id"].iloc[starts[:-1]])
-    drive = ids.get_indexer(points["trace_id"])
+    drive = fleet.ids.get_indexer(points["trace_id"])
     # One ascending key for all drives: the drive, then milliseconds since the first fix of all.
     fix_time, point_time = (_milliseconds(table["t"]) for table in (traces, points))
     timed = ~traces["t"].isna().to_numpy()
@@ -103,8 +102,7 @@ def rows_of_points(fleet: Fleet) -> NDArray[np.int64]:
     first = min(fix_time[timed].min(), point_time[usable].min())
     span = max(fix_time[timed].max(), point_time[usable].max()) - first + 10_000
     rows = np.flatnonzero(timed)
-    owner = np.repeat(np.arange(len(ids)), np.diff(starts))
-    key = owner[rows] * span + fix_time[rows] - first
+    key = fleet.owner[rows] * span + fix_time[rows] - first
     wanted = drive[usable] * span + point_time[usable] - first
     after = np.clip(np.searchsorted(key, wanted), 1, len(key) - 1) if len(key) > 1 else np.zeros(len(wanted), np.int64)
     before = np.maximum(after - 1, 0)
@@ -157,7 +155,7 @@ def _points_are_wrong(fleet: Fleet) -> NDArray[np.bool_]:
     if fleet.points.empty:
         return np.zeros(fleet.n_traces, bool)
     rows = rows_of_points(fleet)
-    drive = pd.Index(fleet.traces["trace_id"].iloc[fleet.starts[:-1]]).get_indexer(fleet.points["trace_id"])
+    drive = fleet.ids.get_indexer(fleet.points["trace_id"])
     stray = rows < 0
     seen = ~stray
     away = [fleet.points[axis].to_numpy()[seen] - fleet.traces[axis].to_numpy()[rows[seen]] for axis in "xy"]

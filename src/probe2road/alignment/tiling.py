@@ -143,12 +143,11 @@ def align_tiles(
     -------
     Moves
     """
-    owner = np.repeat(np.arange(fleet.n_traces), np.diff(fleet.starts))
-    n = len(owner)
+    n = len(fleet.traces)
     total, weight, sights = np.zeros((n, 4)), np.zeros(n), np.zeros(n, np.int64)
     residuals = []
     done = 0
-    for tile, moves in _results(fleet, usable[owner], held, tiles, options, workspace, workers):
+    for tile, moves in _results(fleet, usable[fleet.owner], held, tiles, options, workspace, workers):
         total[moves.row] += moves.weight[:, None] * moves.shift
         weight[moves.row] += moves.weight
         # A point counts in one tile only: the one in whose core its keyframe is.
@@ -283,8 +282,7 @@ def _cut(
     part = Fleet(
         fleet.traces.iloc[rows].reset_index(drop=True), fleet.points.iloc[seen].reset_index(drop=True), fleet.crs
     )
-    owner = np.searchsorted(fleet.starts, rows[part.starts[:-1]], side="right") - 1
-    return part, rows, held[owner]
+    return part, rows, held[fleet.owner[rows[part.starts[:-1]]]]
 
 
 def _align_tile(

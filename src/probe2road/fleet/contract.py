@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,19 @@ class Fleet:
         """Number of traces."""
         return len(self.starts) - 1
 
+    @cached_property
+    def owner(self) -> NDArray[np.int64]:
+        """Number of the trace of every fix, from 0: shape ``(n_fixes,)``, cannot be written to."""
+        starts = self.starts
+        owner = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        owner.setflags(write=False)
+        return owner
+
+    @cached_property
+    def ids(self) -> pd.Index:
+        """Id of every trace: ``fleet.ids[fleet.owner]`` are the ids of the fixes."""
+        return pd.Index(self.traces["trace_id"].iloc[self.starts[:-1]])
+
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """Bounding box ``(left, bottom, right, top)`` of the traces, metres.
@@ -96,6 +110,10 @@ class Fleet:
             points=_projected(self.points, self.crs, target),
             crs=target,
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the tables alone for pickling and copying: what was found in them is quickly found again."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 @dataclass(frozen=True)
@@ -147,7 +165,7 @@ def trace_breaks(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool
     step = np.hypot(*(np.diff(fleet.traces[axis].to_numpy(), prepend=np.nan) for axis in "xy"))
     interval = fix_intervals(fleet.traces["t"])
     within = ~breaks
-    owner = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    owner = fleet.owner
     # Only traces with a fix beyond a fixed limit need their medians: few, where the data is dense.
     suspect = np.zeros(len(starts) - 1, bool)
     with np.errstate(invalid="ignore"):

@@ -25,6 +25,7 @@ from probe2road.errors import InputError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.match import Matches
+from probe2road.matching.tables import step_rows
 
 __all__ = [
     "EdgeLines",
@@ -220,7 +221,7 @@ def frame(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[Traversals,
     >>> driven.low.tolist(), driven.high.tolist(), fixes.left.tolist()
     ([40.0, 0.0], [100.0, 40.0], [2.0, 1.0, -1.0])
     """
-    starts, table = fleet.starts, matches.fixes
+    table = matches.fixes
     if len(table) != len(fleet.traces):
         fault = f"the matches are of {len(table)} fixes, the fleet has {len(fleet.traces)}"
         raise InputError(fault, where="frame", fix="pass the fleet that was matched")
@@ -228,8 +229,8 @@ def frame(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[Traversals,
     row = np.flatnonzero(table["edge"].notna().to_numpy())
     of_fix = graph.edges.index.get_indexer(table["edge"].to_numpy(np.int64, na_value=-1)[row]).astype(np.int64)
     way = table["forward"].to_numpy(bool, na_value=False)[row]
-    owner = np.repeat(np.arange(len(starts) - 1), np.diff(starts))[row]
-    traversal = _dealt_out(owner, of_fix, way, np.searchsorted(trace, np.arange(len(starts))), edge, forward)
+    first = np.searchsorted(trace, np.arange(fleet.n_traces + 1))
+    traversal = _dealt_out(fleet.owner[row], of_fix, way, first, edge, forward)
     row, traversal = row[traversal >= 0], traversal[traversal >= 0]
 
     lines = edge_lines(graph)
@@ -244,12 +245,8 @@ def frame(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[Traversals,
 def _steps(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[NDArray[Any], ...]:
     """Return trace, edge, forward, entered and left of every traversal, shape (T,); broken steps are joined."""
     steps = matches.steps
-    edge = graph.edges.index.get_indexer(steps["edge"]).astype(np.int64)
-    if (edge < 0).any():
-        fault = f"edge {steps['edge'].to_numpy()[edge < 0][0]} of the matches is not in the graph"
-        raise InputError(fault, where="frame", fix="pass the graph that was matched on")
-    names = pd.Index(fleet.traces["trace_id"].to_numpy()[fleet.starts[:-1]])
-    trace = names.get_indexer(steps["trace_id"]).astype(np.int64)
+    edge = step_rows(graph, steps, where="frame")
+    trace = fleet.ids.get_indexer(steps["trace_id"]).astype(np.int64)
     forward, entered, left = (steps[name].to_numpy(bool) for name in ("forward", "entered", "left"))
     again = np.zeros(len(edge), bool)
     again[1:] = ~entered[1:] & (trace[1:] == trace[:-1]) & (edge[1:] == edge[:-1]) & (forward[1:] == forward[:-1])

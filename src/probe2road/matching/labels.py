@@ -15,8 +15,7 @@ import numpy as np
 import pandas as pd
 
 from probe2road.bounds import Above, AtMost, NotNegative, OneOf, Positive
-from probe2road.crs import same_crs
-from probe2road.errors import CRSError
+from probe2road.crs import require_same_crs
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.splitting import split_edges
@@ -124,18 +123,15 @@ def label_pieces(reference: RoadGraph, fleet: Fleet, options: LabelOptions) -> t
     CRSError, MissingExtraError, InputError
         As `label`.
     """
-    if not same_crs(fleet.crs, reference.crs):
-        fault = f"the traces are in {fleet.crs.name}, the reference is in {reference.crs.name}"
-        raise CRSError(fault, where="label", fix="reproject one of them, for example with graph.to_crs")
+    require_same_crs(fleet.crs, reference.crs, where="label", what=("the traces are", "the reference is"))
     pieces = cut_reference(reference, max_piece=options.max_piece)
     ask = _covered_by_osrm if options.matcher == "osrm" else _covered_by_own
     table = _joined(ask(pieces, fleet, options))
     covered = table.groupby(["trace", "edge"])["length"].sum().reset_index()
     length = pieces.edges["length"].to_numpy()
     driven = covered[covered["length"].to_numpy() >= options.min_share * length[covered["edge"]]]
-    ids = fleet.traces["trace_id"].to_numpy()[fleet.starts[:-1]]
     return pieces, pd.DataFrame(
-        {"trace_id": ids[driven["trace"]], "edge": pieces.edges.index.to_numpy()[driven["edge"]]}
+        {"trace_id": fleet.ids[driven["trace"]], "edge": pieces.edges.index.to_numpy()[driven["edge"]]}
     )
 
 

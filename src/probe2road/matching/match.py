@@ -17,8 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.bounds import OneOf, Positive
-from probe2road.crs import require_metric, same_crs
-from probe2road.errors import CRSError, InputError
+from probe2road.crs import require_metric, require_same_crs
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import TURN_DTYPES
@@ -27,7 +26,7 @@ from probe2road.matching.models import FLEET, SPARSE, PublishedModel, RouteModel
 from probe2road.matching.network import States, build_follow, build_states, edge_weight_array
 from probe2road.matching.observe import observe, sampling_interval, seconds
 from probe2road.matching.published import match_published
-from probe2road.matching.tables import fix_table, joined_paths, step_table
+from probe2road.matching.tables import fix_table, joined_paths, step_rows, step_table
 from probe2road.matching.viterbi import parameters
 from probe2road.options import checked
 
@@ -125,9 +124,7 @@ def match(
     """
     options = options or MatchOptions()
     require_metric(graph.crs, where="graph")
-    if not same_crs(fleet.crs, graph.crs):
-        fault = f"the traces are in {fleet.crs.name}, the graph is in {graph.crs.name}"
-        raise CRSError(fault, where="match", fix="reproject one of them, for example with graph.to_crs")
+    require_same_crs(fleet.crs, graph.crs, where="match")
     states = build_states(graph, respect_oneway=options.respect_oneway)
     weight = edge_weight_array(graph, edge_weights)
     profile = _profiles(fleet, options)
@@ -135,7 +132,7 @@ def match(
     for name in np.unique(profile):
         traces = np.flatnonzero(profile == name)
         found.append((traces, _match_profile(_with_traces(fleet, traces), states, weight, str(name), options)))
-    paths = joined_paths(found, fleet.starts)
+    paths = joined_paths(found, fleet.owner)
     radius = np.array([_radius(str(name), options) for name in profile])
     matches = Matches(fix_table(graph, fleet, states, paths, radius), step_table(graph, fleet, states, paths))
     logger.info(
@@ -178,12 +175,8 @@ def turn_counts(matches: Matches, graph: RoadGraph) -> pd.DataFrame:
     """
     steps = matches.steps
     onto = np.flatnonzero(steps["entered"].to_numpy())
-    edge = steps["edge"].to_numpy()
+    edge = graph.edges.index.to_numpy()[step_rows(graph, steps, where="turn_counts")]
     via = steps["via_node"].to_numpy(np.int64, na_value=-1)
-    unknown = ~np.isin(edge, graph.edges.index)
-    if unknown.any():
-        fault = f"edge {edge[unknown][0]} of the matches is not in the graph"
-        raise InputError(fault, where="turn_counts", fix="pass the graph that was matched on")
     turns = pd.DataFrame({"from_edge": edge[onto - 1], "via_node": via[onto], "to_edge": edge[onto]})
     counted = turns.value_counts(sort=False).rename("count").reset_index()
     return counted.sort_values(list(TURN_DTYPES)[:3], ignore_index=True).astype(TURN_DTYPES)
@@ -203,7 +196,7 @@ def _with_traces(fleet: Fleet, traces: NDArray[np.int64]) -> Fleet:
         return fleet
     chosen = np.zeros(fleet.n_traces, bool)
     chosen[traces] = True
-    return replace(fleet, traces=fleet.traces[np.repeat(chosen, np.diff(fleet.starts))])
+    return replace(fleet, traces=fleet.traces[chosen[fleet.owner]])
 
 
 def _match_profile(

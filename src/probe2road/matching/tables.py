@@ -8,23 +8,24 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from probe2road.errors import InputError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.chains import Paths
 from probe2road.matching.network import States
 
-__all__ = ["fix_table", "joined_paths", "step_table"]
+__all__ = ["fix_table", "joined_paths", "step_rows", "step_table"]
 
 
-def joined_paths(found: list[tuple[NDArray[np.int64], Paths]], starts: NDArray[np.int64]) -> Paths:
+def joined_paths(found: list[tuple[NDArray[np.int64], Paths]], owner: NDArray[np.int64]) -> Paths:
     """Bring the paths of groups of traces into the order of all traces.
 
     Parameters
     ----------
     found
         For each group, the numbers of its traces, ascending, and its paths; together all traces.
-    starts
-        Shape (traces + 1,): first fix of every trace, and the number of fixes.
+    owner
+        Number of the trace of every fix: `Fleet.owner`.
     """
     if len(found) == 1:
         return found[0][1]
@@ -32,7 +33,6 @@ def joined_paths(found: list[tuple[NDArray[np.int64], Paths]], starts: NDArray[n
     order = np.argsort(trace, kind="stable")
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
-    owner = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     fixes = np.argsort(np.concatenate([np.flatnonzero(np.isin(owner, traces)) for traces, _ in found]))
     offset, step = 0, []
     for _, paths in found:
@@ -87,7 +87,7 @@ def _reasons(fleet: Fleet, states: States, paths: Paths, radius: NDArray[np.floa
     """Say of every fix without an edge why, missing for the others."""
     names = [f"no edge within {value:g} m" for value in np.unique(radius)]
     fits_none, no_edges = len(names), len(names) + 1
-    code = np.repeat(np.searchsorted(np.unique(radius), radius), np.diff(fleet.starts))
+    code = np.searchsorted(np.unique(radius), radius)[fleet.owner]
     code[paths.near] = fits_none
     if not len(states.length):
         code[:] = no_edges
@@ -98,16 +98,15 @@ def _reasons(fleet: Fleet, states: States, paths: Paths, radius: NDArray[np.floa
 def step_table(graph: RoadGraph, fleet: Fleet, states: States, paths: Paths) -> pd.DataFrame:
     """Write one row for each traversal of an edge."""
     n_steps = len(paths.state)
-    starts = fleet.starts
     node_id = graph.nodes.index.to_numpy(np.int64)
     via = np.where(paths.entered, node_id[states.tail[paths.state]], 0) if n_steps else np.zeros(0, np.int64)
-    counts = np.bincount(paths.trace, minlength=len(starts) - 1)
+    counts = np.bincount(paths.trace, minlength=fleet.n_traces)
     position = np.arange(n_steps) - np.repeat(np.cumsum(counts) - counts, counts)
     first, last = _first_and_last_fix(paths)
     times = fleet.traces["t"]
     return pd.DataFrame(
         {
-            "trace_id": fleet.traces["trace_id"].take(starts[:-1][paths.trace]).array,
+            "trace_id": fleet.ids[paths.trace].array,
             "position": position,
             "edge": graph.edges.index.to_numpy(np.int64)[paths.state >> 1],
             "forward": paths.state & 1 == 0,
@@ -119,6 +118,39 @@ def step_table(graph: RoadGraph, fleet: Fleet, states: States, paths: Paths) -> 
             "part": paths.part,
         }
     )
+
+
+def step_rows(graph: RoadGraph, steps: pd.DataFrame, *, where: str) -> NDArray[np.int64]:
+    """Return the row of the edge of each step.
+
+    Parameters
+    ----------
+    graph
+        The graph that was matched on.
+    steps
+        Matched paths: a table with a column ``edge``.
+    where
+        Who asks, for the message.
+
+    Raises
+    ------
+    InputError
+        If the steps name an edge that is not in the graph.
+
+    Examples
+    --------
+    >>> from probe2road.graph.roadgraph import graph_from_lines
+    >>> graph = graph_from_lines([[(0, 0), (9, 0)]], crs="EPSG:32616")
+    >>> step_rows(graph, pd.DataFrame({"edge": [0, 7]}), where="match")
+    Traceback (most recent call last):
+        ...
+    probe2road.errors.InputError: match: edge 7 of the matches is not in the graph; pass the graph that was matched on
+    """
+    row = graph.edges.index.get_indexer(steps["edge"]).astype(np.int64)
+    if (row < 0).any():
+        fault = f"edge {steps['edge'].to_numpy()[row < 0][0]} of the matches is not in the graph"
+        raise InputError(fault, where=where, fix="pass the graph that was matched on")
+    return row
 
 
 def _first_and_last_fix(paths: Paths) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

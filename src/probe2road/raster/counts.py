@@ -17,7 +17,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from probe2road.errors import CRSError, InputError
+from probe2road.crs import require_same_crs
+from probe2road.errors import InputError
 from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
 from probe2road.raster.grid import Grid, Window, sparse_zeros
 
@@ -119,8 +120,7 @@ def rasterize_windows(
     Window, ndarray of uint32
         The window and its counts, shape ``(3, rows + 2 halo, cols + 2 halo)``.
     """
-    if fleet.crs != grid.crs:
-        raise CRSError(f"the fleet is in {fleet.crs.name}, the grid in {grid.crs.name}", fix="use fleet.to_crs")
+    require_same_crs(fleet.crs, grid.crs, where="rasterize", what=("the traces are", "the grid is"))
     row, col = grid.rowcol(fleet.traces["x"], fleet.traces["y"])
     breaks = trace_breaks(fleet, gaps)
     point_row, point_col = grid.rowcol(fleet.points["x"], fleet.points["y"])

@@ -7,8 +7,8 @@ import shapely
 from numba import njit
 from numpy.typing import NDArray
 
-from probe2road.crs import same_crs
-from probe2road.errors import CRSError, OptionError
+from probe2road.crs import require_same_crs
+from probe2road.errors import OptionError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster.grid import Grid
 
@@ -51,9 +51,7 @@ def label_mask(graph: RoadGraph, grid: Grid, *, width: int = 1) -> NDArray[np.ui
            [0, 0, 0, 1, 0],
            [1, 1, 1, 0, 0]], dtype=uint8)
     """
-    if not same_crs(graph.crs, grid.crs):
-        fault = f"the graph is in {graph.crs.name}, the grid is in {grid.crs.name}"
-        raise CRSError(fault, where="label_mask", fix="use graph.to_crs")
+    require_same_crs(graph.crs, grid.crs, where="label_mask", what=("the graph is", "the grid is"))
     xy, owner = shapely.get_coordinates(graph.edges.geometry.to_numpy(), return_index=True)
     return draw_lines(*grid.rowcol(xy[:, 0], xy[:, 1]), owner, grid.shape, width=width)
 

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import betaln
 
 from probe2road.bounds import NotNegative, Positive, Probability
-from probe2road.crs import same_crs
-from probe2road.errors import CRSError
+from probe2road.crs import require_same_crs
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import FramedFixes, Traversals, edge_lines, frame, robust_sigma
@@ -107,9 +106,7 @@ def add_evidence(
     LINESTRING Z (0 0 7, 100 0 7)
     """
     options = options or EvidenceOptions()
-    if not same_crs(fleet.crs, graph.crs):
-        fault = f"the traces are in {fleet.crs.name}, the graph is in {graph.crs.name}"
-        raise CRSError(fault, where="add_evidence", fix="reproject one of them, for example with graph.to_crs")
+    require_same_crs(fleet.crs, graph.crs, where="add_evidence")
     driven, fixes = frame(graph, fleet, matches)
     counted = _counts(graph, fleet, driven, options)
     measured = {

@@ -119,7 +119,7 @@ def _stretches(fleet: Fleet, row: NDArray[np.int64], trace: NDArray[np.int64], l
     step = np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)
     step[fleet.starts[:-1]] = 0.0
     driven = np.cumsum(step)
-    driven -= np.repeat(driven[fleet.starts[:-1]], np.diff(fleet.starts))
+    driven -= driven[fleet.starts[:-1]][fleet.owner]
     piece = (driven[row] / longest).astype(np.int64)
     return pd.factorize(trace * (int(piece.max(initial=0)) + 1) + piece)[0].astype(np.int64)
 

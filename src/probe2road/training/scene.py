@@ -19,8 +19,8 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from probe2road.crs import same_crs
-from probe2road.errors import CRSError, InputError
+from probe2road.crs import require_same_crs
+from probe2road.errors import InputError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path
@@ -106,19 +106,16 @@ def make_scene(
     >>> scene.n_drives, len(scene.spots), np.sort(near).tolist()
     (1, 20, [0, 1, 2, 3])
     """
-    if not same_crs(fleet.crs, reference.crs):
-        fault = f"the fleet is in {fleet.crs.name}, the reference is in {reference.crs.name}"
-        raise CRSError(fault, where="make_scene", fix="reproject one of them, for example with graph.to_crs")
+    require_same_crs(fleet.crs, reference.crs, where="make_scene", what=("the traces are", "the reference is"))
     if fleet.traces.empty:
         raise InputError("no fixes, so there is nothing to learn from", where="fleet")
-    ids = pd.Index(fleet.traces["trace_id"].unique())
     left, bottom, right, top = fleet.bounds
     origin = np.array([np.floor(left / CELL), np.floor(bottom / CELL)]) * CELL
     cols, rows = (np.floor((np.array([right, top]) - origin) / CELL)).astype(np.int64) + 1
     table = np.array([rows, cols])
-    fixes = _fixes(fleet, ids, origin, table)
-    points = _points(fleet, ids, origin, table)
-    roads = _roads(reference, driven, ids, origin, area)
+    fixes = _fixes(fleet, origin, table)
+    points = _points(fleet, origin, table)
+    roads = _roads(reference, driven, fleet.ids, origin, area)
     if not len(roads["spots"]):
         raise InputError("no road within the area, so there is nothing to learn", where="reference")
     scene = Scene(**fixes, **points, **roads, table=table, origin=origin)
@@ -195,13 +192,11 @@ def rows_around(
     return np.concatenate([np.arange(starts[i * cols + low_col], starts[i * cols + high_col + 1]) for i in lines])
 
 
-def _fixes(
-    fleet: Fleet, ids: pd.Index, origin: NDArray[np.float64], table: NDArray[np.int64]
-) -> dict[str, NDArray[Any]]:
+def _fixes(fleet: Fleet, origin: NDArray[np.float64], table: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     """Arrays of the fixes."""
     traces = fleet.traces
     xy = traces[["x", "y"]].to_numpy() - origin
-    drive = ids.get_indexer(traces["trace_id"]).astype(np.int32)
+    drive = fleet.owner.astype(np.int32)
     first = fleet.starts[:-1][drive]
     time = traces["t"].to_numpy(dtype="datetime64[ns]")
     seconds = (time - time[first]) / np.timedelta64(1, "s")
@@ -215,16 +210,14 @@ def _fixes(
     }
 
 
-def _points(
-    fleet: Fleet, ids: pd.Index, origin: NDArray[np.float64], table: NDArray[np.int64]
-) -> dict[str, NDArray[Any]]:
+def _points(fleet: Fleet, origin: NDArray[np.float64], table: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     """Arrays of the semantic points; those far from all traces go to the nearest cell, where no window finds them."""
     xy = (fleet.points[["x", "y"]].to_numpy() - origin).astype(np.float32)
     order, starts = _by_cell(xy, table)
     return {
         "point_xy": xy[order],
         "point_kind": fleet.points["kind"].cat.codes.to_numpy(np.uint8)[order],
-        "point_drive": ids.get_indexer(fleet.points["trace_id"]).astype(np.int32)[order],
+        "point_drive": fleet.ids.get_indexer(fleet.points["trace_id"]).astype(np.int32)[order],
         "point_cells": starts,
     }
 

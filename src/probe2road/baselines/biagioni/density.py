@@ -136,9 +136,8 @@ def level_ranks(
 def _segments(fleet: Fleet, grid: Grid, gaps: TraceGaps | None) -> NDArray[np.int64]:
     """List trip, row and column of the start, and row and column of the end of all segments; shape ``(5, S)``."""
     row, col = grid.rowcol(fleet.traces["x"], fleet.traces["y"])
-    trip = np.repeat(np.arange(fleet.n_traces), np.diff(fleet.starts))
     end = np.flatnonzero(~trace_breaks(fleet, gaps))
-    return np.stack([trip[end], row[end - 1], col[end - 1], row[end], col[end]])
+    return np.stack([fleet.owner[end], row[end - 1], col[end - 1], row[end], col[end]])
 
 
 def _drawn(segments: NDArray[np.int64], window: Window) -> NDArray[np.int32]:

@@ -92,9 +92,8 @@ def observe_trips(fleet: Fleet, *, step: float, gaps: TraceGaps | None = None) -
     fix = np.repeat(np.arange(len(values)), count)
     left = np.cumsum(count)[fix] - 1 - np.arange(len(fix))  # steps to go to the fix
     x, y, seconds = (values[fix] - (left / count[fix])[:, None] * moved[fix]).T
-    trip = np.repeat(np.arange(fleet.n_traces), np.diff(fleet.starts))[fix]
     traces = pd.DataFrame({"trace_id": np.cumsum(breaks)[fix], "t": pd.NaT, "x": x, "y": y, "z": np.nan})
-    return Observations(replace(fleet, traces=traces), trip, seconds)
+    return Observations(replace(fleet, traces=traces), fleet.owner[fix], seconds)
 
 
 def match_pieces(

@@ -118,11 +118,10 @@ def thin_traces(fleet: Fleet, options: FeatureOptions | None = None, *, gaps: Tr
     length = np.hypot(np.diff(x, prepend=0.0), np.diff(y, prepend=0.0))
     time = fleet.traces["t"].to_numpy(dtype="datetime64[ns]")[kept]
     seconds = np.diff(time, prepend=np.datetime64("NaT", "ns")) / np.timedelta64(1, "s")
-    owner = np.repeat(np.arange(fleet.n_traces), np.diff(fleet.starts))
     return Steps(
         x=x,
         y=y,
-        trace=owner[kept],
+        trace=fleet.owner[kept],
         starts=np.append(np.flatnonzero(first), len(kept)),
         valid=~first & (length > options.min_step) & (length < options.max_step),
         seconds=np.where(first, np.nan, seconds),
