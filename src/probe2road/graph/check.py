@@ -8,6 +8,7 @@ import shapely
 
 from probe2road.crs import require_metric
 from probe2road.errors import InputError
+from probe2road.graph.ends import end_rows
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import EDGE_DTYPES, ORIGINS
 
@@ -77,11 +78,11 @@ def _edge_faults(graph: RoadGraph) -> list[str]:
     if not kind.all():
         return [f"edge {edges.index[~kind][0]} is not a LineString"]
     position = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
-    row = pd.Series(np.arange(len(graph.nodes)), index=graph.nodes.index)
     checks = {"has no length": shapely.length(geometry) > 0}
-    for end, vertex in (("u", 0), ("v", -1)):
+    # Not those that the graph keeps: what is checked here may have been changed since.
+    for end, vertex, row in zip("uv", (0, -1), end_rows(graph.nodes, edges).T, strict=True):
         ends = shapely.get_coordinates(shapely.get_point(geometry, vertex))
-        away = np.hypot(*(ends - position[row[edges[end]].to_numpy()]).T)
+        away = np.hypot(*(ends - position[row]).T)
         checks[f"does not touch its node {end}"] = away <= _END_TOLERANCE
     checks["has a length that differs from its geometry"] = np.isclose(
         edges["length"], shapely.length(geometry), rtol=1e-6, atol=1e-3

@@ -25,7 +25,7 @@ from probe2road.bounds import NotNegative
 from probe2road.errors import OptionError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import finish_edges
-from probe2road.graph.topology import Network, chains, contract_short_edges, end_nodes, joined_lines, mates
+from probe2road.graph.topology import Network, chains, contract_short_edges, joined_lines, mates
 from probe2road.options import checked
 
 __all__ = [
@@ -144,7 +144,7 @@ def drop_small_components(graph: RoadGraph, *, min_length: float = 15.0) -> Road
     {1: 49.0}
     """
     _require_length(min_length, "min_length")
-    u, v = _end_rows(graph)
+    u, v = graph.end_rows.T
     n_nodes = len(graph.nodes)
     adjacency = coo_array((np.ones(len(u), bool), (u, v)), shape=(n_nodes, n_nodes))
     _, component = connected_components(adjacency, directed=False) if n_nodes else (0, np.zeros(0, np.int64))
@@ -193,8 +193,8 @@ def drop_dead_ends(graph: RoadGraph, *, min_length: float = 15.0) -> RoadGraph:
     done = None
     while done is not graph:
         graph = done = merge_degree_two_nodes(graph)
-        u, v = _end_rows(graph)
-        degree = np.bincount(end_nodes(u, v), minlength=len(graph.nodes))
+        u, v = graph.end_rows.T
+        degree = np.bincount(graph.end_rows.ravel(), minlength=len(graph.nodes))
         length = graph.edges["length"].to_numpy()
         tips = (degree[u] == 1).astype(int) + (degree[v] == 1)
         spur = np.flatnonzero((tips == 1) & (length < min_length))
@@ -313,7 +313,7 @@ def merge_degree_two_nodes(graph: RoadGraph) -> RoadGraph:
     >>> merge_degree_two_nodes(ring).edges[["u", "v", "length"]].values.tolist()
     [[0.0, 0.0, 36.0]]
     """
-    u, v = _end_rows(graph)
+    u, v = graph.end_rows.T
     mate = mates(u, v)
     if not (mate >= 0).any():
         return graph
@@ -338,21 +338,15 @@ def merge_degree_two_nodes(graph: RoadGraph) -> RoadGraph:
     return replace(graph, nodes=nodes, edges=finish_edges(merged), turns=turns)
 
 
-def _end_rows(graph: RoadGraph) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the nodes table at which edges start and stop."""
-    row = pd.Series(np.arange(len(graph.nodes)), index=graph.nodes.index)
-    return row[graph.edges["u"]].to_numpy(), row[graph.edges["v"]].to_numpy()
-
-
 def _network(graph: RoadGraph) -> Network:
     """Take a graph apart into arrays; heights stay with the vertices."""
-    u, v = _end_rows(graph)
+    u, v = graph.end_rows.T
     lines = graph.edges.geometry.to_numpy()
     vertices = shapely.get_coordinates(lines, include_z=bool(shapely.has_z(lines).any()))
     return Network(
         position=shapely.get_coordinates(graph.nodes.geometry.to_numpy()),
-        u=u,
-        v=v,
+        u=u.copy(),  # not a column of a table that is read-only: one type of array for the kernels
+        v=v.copy(),
         vertices=vertices,
         offsets=np.concatenate([[0], np.cumsum(shapely.get_num_coordinates(lines))]),
         edge=np.arange(len(u)),

@@ -9,7 +9,8 @@ and backward counts say otherwise.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import geopandas as gpd
@@ -24,6 +25,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from probe2road.crs import parse_crs, require_metric
+from probe2road.graph.ends import EdgeEnds, end_rows
 from probe2road.graph.networkx import to_networkx
 from probe2road.graph.tables import degrees, empty_turns, finish_edges, move_ends
 
@@ -80,6 +82,41 @@ class RoadGraph:
         """Count the edge ends at every node, indexed like ``nodes``; a loop counts twice."""
         return degrees(self.nodes, self.edges)
 
+    @cached_property
+    def end_rows(self) -> NDArray[np.int64]:
+        """Rows of ``nodes`` at which the edges start and stop, shape ``(E, 2)``; raveled, by number of the end."""
+        rows = end_rows(self.nodes, self.edges)
+        rows.setflags(write=False)
+        return rows
+
+    def ends(self, *, reach: float, skip: float = 0.0, share: float = 1.0) -> EdgeEnds:
+        """Return the nodes, places and directions of all edge ends, numbered as in `probe2road.graph.ends`.
+
+        They are measured once for each choice of lengths, and kept: their arrays cannot be written to.
+
+        Parameters
+        ----------
+        reach
+            Metres from the node up to which the direction is measured.
+        skip
+            Metres from the node that are left out of it; at most half of the reach on that edge.
+        share
+            Of the length of an edge, what the reach is at most.
+
+        Examples
+        --------
+        >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 50)]], crs="EPSG:32616")
+        >>> ends = graph.ends(reach=20.0)
+        >>> ends.node.tolist(), ends.ahead[1].tolist()
+        ([0, 1, 1, 2], [-1.0, 0.0])
+        """
+        measured: dict[tuple[float, float, float], EdgeEnds] = self.__dict__.setdefault("_ends", {})
+        lengths = (reach, skip, share)
+        if lengths not in measured:
+            lines = self.edges.geometry.to_numpy()
+            measured[lengths] = EdgeEnds.from_lines(lines, self.end_rows, reach=reach, skip=skip, share=share)
+        return measured[lengths]
+
     def to_crs(self, crs: Any) -> RoadGraph:
         """Return the graph in another metric CRS, lengths measured anew.
 
@@ -98,6 +135,10 @@ class RoadGraph:
     def to_networkx(self, *, min_count: int = 5) -> nx.MultiDiGraph:
         """Return an OSMnx ``MultiDiGraph``; see `probe2road.graph.networkx.to_networkx`."""
         return to_networkx(self.nodes, self.edges, self.turns, min_count=min_count)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the tables alone for pickling and copying: what was measured of them is quickly measured again."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def __repr__(self) -> str:
         return (

@@ -20,7 +20,7 @@ import shapely
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["Network", "chains", "contract_short_edges", "directions_away", "end_nodes", "joined_lines", "mates"]
+__all__ = ["Network", "chains", "contract_short_edges", "end_nodes", "joined_lines", "mates"]
 
 _FADE = 1.5  # times the distance of two contracted nodes; within it edges are led straight to the new node
 
@@ -52,31 +52,6 @@ class Network:
     offsets: NDArray[np.int64]
     edge: NDArray[np.int64]
     weight: NDArray[np.int64]
-
-
-def directions_away(lines: NDArray[np.object_], near: float, far: float) -> NDArray[np.float64]:
-    """Return the direction in which each end of some lines leads away from its node.
-
-    It is measured between two distances (m) from the node, or less on short lines.
-
-    Returns
-    -------
-    ndarray, shape (2 E, 2)
-        Unit vectors; zeros for a line that goes nowhere.
-
-    Examples
-    --------
-    >>> directions_away(np.array([shapely.LineString([(0, 0), (50, 0)])]), 10.0, 40.0).tolist()
-    [[1.0, 0.0], [-1.0, 0.0]]
-    """
-    lines = shapely.force_2d(lines)
-    length = shapely.length(lines)
-    farthest = np.minimum(far, 0.9 * length)
-    nearest = np.minimum(near, 0.5 * farthest)
-    along = [np.stack([at, length - at], axis=1) for at in (nearest, farthest)]
-    here, there = (shapely.get_coordinates(shapely.line_interpolate_point(lines[:, None], at).ravel()) for at in along)
-    away = there - here
-    return np.asarray(away / np.maximum(np.hypot(*away.T), 1e-9)[:, None])
 
 
 def end_nodes(u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.int64]:

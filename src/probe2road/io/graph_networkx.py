@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from probe2road.crs import local_crs, parse_crs, require_metric
 from probe2road.errors import CRSError, InputError
 from probe2road.graph.check import check_graph
+from probe2road.graph.ends import end_rows
 from probe2road.graph.networkx import present
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import EDGE_DTYPES, empty_turns, finish_edges, move_ends
@@ -99,7 +100,7 @@ def _nodes_from_networkx(graph: nx.Graph, crs: Any) -> gpd.GeoDataFrame:
 def _drawn(table: pd.DataFrame, nodes: gpd.GeoDataFrame) -> NDArray[Any]:
     """Return the geometry of every directed edge, straight where it has none."""
     position = nodes.get_coordinates().to_numpy()
-    u, v = (position[nodes.index.get_indexer(table[end])] for end in ("u", "v"))
+    u, v = position[end_rows(nodes, table).T]
     straight = shapely.linestrings(np.stack([u, v], axis=1)) if len(table) else np.zeros(0, object)
     if "geometry" not in table:
         return straight
@@ -135,7 +136,7 @@ def _from_foreign(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame) -> RoadGraph
         edges = edges.assign(oneway=edges["oneway"].map(_flag) & single[edges.index])
 
     position = nodes.get_coordinates().to_numpy()
-    u, v = (position[nodes.index.get_indexer(edges[end])] for end in ("u", "v"))
+    u, v = position[end_rows(nodes, edges).T]
     lines = _towards(edges.geometry.to_numpy(), u)
     first, last = (shapely.get_coordinates(shapely.get_point(lines, end)) for end in (0, -1))
     near = [np.hypot(*(ends - place).T)[:, None] <= _END_TOLERANCE for ends, place in ((first, u), (last, v))]

@@ -103,8 +103,7 @@ def build_states(graph: RoadGraph, *, respect_oneway: bool = True) -> States:
     ([0, 1, 1, 2], [1, 0, 2, 1], [0.0, 0.0, 4.0])
     """
     edges = graph.edges
-    ends = np.stack([graph.nodes.index.get_indexer(edges[end]) for end in ("u", "v")], axis=1).astype(np.int64)
-    tail, head = ends.ravel(), ends[:, ::-1].ravel()
+    tail, head = graph.end_rows.flatten(), graph.end_rows[:, ::-1].flatten()
     allowed = np.ones(len(tail), bool)
     if respect_oneway and len(edges):
         direction = driving_direction(edges).to_numpy()
@@ -184,7 +183,10 @@ def build_follow(states: States, weight: NDArray[np.float64], *, uturn_cost: flo
 
 
 def _end_directions(states: States) -> tuple[NDArray[np.float64], ...]:
-    """Return the unit directions in which directed edges start and end, shape (D,) each; 0 without length."""
+    """Return the unit directions in which directed edges start and end, shape (D,) each; 0 without length.
+
+    Those of their first and last piece, however short: the costs of turns are fitted to these, not to `RoadGraph.ends`.
+    """
     solid = np.flatnonzero(states.size > 0)
     n_edges = len(states.length)
     result = [np.zeros(2 * n_edges) for _ in range(4)]

@@ -149,8 +149,7 @@ def osrm_network(graph: RoadGraph, options: OsrmOptions | None = None) -> OsrmNe
     first = np.searchsorted(edge, np.arange(n_edges))
     last = np.searchsorted(edge, np.arange(n_edges), side="right") - 1
     vertex = np.full(len(edge), -1)
-    for place, end in ((first, "u"), (last, "v")):
-        vertex[place] = graph.nodes.index.get_indexer(graph.edges[end])
+    vertex[first], vertex[last] = graph.end_rows.T
     inner = np.flatnonzero(vertex < 0)
     vertex[inner] = n_nodes + np.arange(len(inner))
     position = np.zeros((n_nodes + len(inner), 2))

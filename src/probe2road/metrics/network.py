@@ -76,7 +76,7 @@ def network_from_graph(graph: RoadGraph) -> Network:
     ([5.0, 8.0], [0.0, 5.0, 0.0, 5.0, 8.0], [1, 2, 1])
     """
     node_xy = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
-    u, v = (graph.nodes.index.get_indexer(graph.edges[end]).astype(np.int64) for end in ("u", "v"))
+    u, v = (rows.copy() for rows in graph.end_rows.T)
     xy, owner = shapely.get_coordinates(graph.edges.geometry.to_numpy(), return_index=True)
     n_edges = len(u)
     first = np.searchsorted(owner, np.arange(n_edges + 1)).astype(np.int64)
@@ -86,7 +86,7 @@ def network_from_graph(graph: RoadGraph) -> Network:
     step[first[:-1]] = 0.0
     total = np.cumsum(step)
     along = total - total[first[:-1]][owner]
-    ends = np.stack([u, v], axis=1).ravel()
+    ends = graph.end_rows.ravel()
     order = np.argsort(ends, kind="stable")
     return Network(
         node_xy=node_xy,

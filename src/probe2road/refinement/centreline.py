@@ -24,8 +24,7 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.bounds import NotNegative, Positive, Share
-from probe2road.crs import same_crs
-from probe2road.errors import CRSError
+from probe2road.crs import require_same_crs
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import (
@@ -118,9 +117,7 @@ def refine_centreline(
     True
     """
     options = options or CentrelineOptions()
-    if not same_crs(fleet.crs, graph.crs):
-        fault = f"the traces are in {fleet.crs.name}, the graph is in {graph.crs.name}"
-        raise CRSError(fault, where="refine_centreline", fix="reproject one of them, for example with graph.to_crs")
+    require_same_crs(fleet.crs, graph.crs, where="refine_centreline")
     driven, fixes = frame(graph, fleet, matches)
     if not len(graph.edges) or not len(fixes.row):
         return graph
@@ -149,36 +146,71 @@ def _enough(driven: Traversals, n_edges: int, min_traces: int) -> NDArray[np.boo
     return np.bincount(pairs[0], minlength=n_edges) >= min_traces
 
 
+@dataclass(frozen=True)
+class _Votes:
+    """V votes: where one drive along an edge was when it passed a station."""
+
+    place: NDArray[np.int64]  # (V,) station
+    edge: NDArray[np.int64]  # (V,)
+    forward: NDArray[np.bool_]  # (V,) whether it was driven from u to v
+    left: NDArray[np.float64]  # (V,) m to the left of the edge
+
+    def where(self, kept: NDArray[np.bool_]) -> _Votes:
+        """Return some of the votes."""
+        return _Votes(self.place[kept], self.edge[kept], self.forward[kept], self.left[kept])
+
+
+@dataclass(frozen=True)
+class _Ways:
+    """The two directions of traffic on each edge; zeros and False where only one is driven."""
+
+    half: NDArray[np.float64]  # (E,) m to the left, half of what lies between the backward and the forward traffic
+    two: NDArray[np.bool_]  # (E,) whether both directions are driven
+    apart: NDArray[np.bool_]  # (E,) whether they are too far apart to be one road
+    mostly_forward: NDArray[np.bool_]  # (E,)
+
+
 def _offsets(
     driven: Traversals, fixes: FramedFixes, stations: Stations, options: CentrelineOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Offset of the middle at every station (m to the left, NaN without votes), and its votes; shape (S,) each."""
     n, n_edges = len(stations.edge), len(stations.spacing)
-    near = np.abs(fixes.left) <= options.max_left
-    place = stations.nearest(driven.edge[fixes.traversal], fixes.along)
-    votes = pd.DataFrame({"place": place, "traversal": fixes.traversal, "left": fixes.left})[near]
-    votes = votes.groupby(["place", "traversal"], sort=True)["left"].mean().reset_index()
-    place, left = votes["place"].to_numpy(), votes["left"].to_numpy()
-    edge, forward = stations.edge[place], driven.forward[votes["traversal"].to_numpy()]
-    of_way = 2 * edge + forward
-    count = np.bincount(of_way, minlength=2 * n_edges).reshape(-1, 2)
-    both = count.min(axis=1) >= np.maximum(options.two_way_share * count.sum(axis=1), 3)
-    middle = np.zeros(2 * n_edges)
-    medians = pd.Series(left).groupby(of_way).median()
-    middle[medians.index.to_numpy()] = medians.to_numpy()
-    half = np.where(both, (middle[1::2] - middle[0::2]) / 2, 0.0)  # of the way from the backward to the forward traffic
-    apart = both & (np.abs(middle[1::2] - middle[0::2]) > options.max_gap)
+    votes = _votes(driven, fixes, stations, options.max_left)
+    ways = _ways(votes, n_edges, options)
     # A few votes against the traffic of a one-way road are wrong matches.
-    common = both[edge] | (forward == (count[edge, 1] >= count[edge, 0]))
-    centred = (left - np.where(forward, half[edge], -half[edge]))[common]
-    found = pd.Series(centred).groupby(place[common]).agg(["median", "count"])
+    votes = votes.where(ways.two[votes.edge] | (votes.forward == ways.mostly_forward[votes.edge]))
+    centred = votes.left - np.where(votes.forward, ways.half[votes.edge], -ways.half[votes.edge])
+    found = pd.Series(centred).groupby(votes.place).agg(["median", "count"])
     offset, weight = np.full(n, np.nan), np.zeros(n)
     offset[found.index.to_numpy()] = found["median"].to_numpy()
     weight[found.index.to_numpy()] = found["count"].to_numpy()
-    spread = robust_sigma(centred, edge[common], n_edges)
+    spread = robust_sigma(centred, votes.edge, n_edges)
     spread = np.maximum(np.nan_to_num(spread, nan=options.vote_sigma), options.vote_sigma)
-    weight[apart[stations.edge]] = 0.0
+    weight[ways.apart[stations.edge]] = 0.0
     return offset, weight * (options.vote_sigma / spread[stations.edge]) ** 2
+
+
+def _votes(driven: Traversals, fixes: FramedFixes, stations: Stations, max_left: float) -> _Votes:
+    """Take the mean of the fixes of every drive near every station, up to a distance (m) from the edge."""
+    near = np.abs(fixes.left) <= max_left
+    place = stations.nearest(driven.edge[fixes.traversal], fixes.along)
+    table = pd.DataFrame({"place": place, "traversal": fixes.traversal, "left": fixes.left})[near]
+    means = table.groupby(["place", "traversal"], sort=True)["left"].mean().reset_index()
+    place = means["place"].to_numpy()
+    return _Votes(place, stations.edge[place], driven.forward[means["traversal"].to_numpy()], means["left"].to_numpy())
+
+
+def _ways(votes: _Votes, n_edges: int, options: CentrelineOptions) -> _Ways:
+    """Tell on which edges both directions are driven, and how far from each other."""
+    of_way = 2 * votes.edge + votes.forward
+    count = np.bincount(of_way, minlength=2 * n_edges).reshape(-1, 2)
+    two = count.min(axis=1) >= np.maximum(options.two_way_share * count.sum(axis=1), 3)
+    middle = np.zeros(2 * n_edges)
+    medians = pd.Series(votes.left).groupby(of_way).median()
+    middle[medians.index.to_numpy()] = medians.to_numpy()
+    between = middle[1::2] - middle[0::2]
+    apart = two & (np.abs(between) > options.max_gap)
+    return _Ways(np.where(two, between / 2, 0.0), two, apart, count[:, 1] >= count[:, 0])
 
 
 def _between_boundaries(
@@ -287,7 +319,7 @@ def _planned(
     after, _ = lines.at(stations.edge, stations.along + options.spacing)
     chord = (after - before)[:, :2]  # its direction turns slowly, so that neighbours do not cross in bends
     normal = np.column_stack([-chord[:, 1], chord[:, 0]]) / np.maximum(np.hypot(*chord.T), 1e-9)[:, None]
-    node = np.stack([graph.nodes.index.get_indexer(graph.edges[end]) for end in ("u", "v")], axis=1).astype(np.int64)
+    node = graph.end_rows
     end = np.stack([stations.first[:-1], stations.first[1:] - 1], axis=1)
 
     # What a node is to do: least squares over what its edges want across, drawn towards staying.

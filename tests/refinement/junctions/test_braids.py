@@ -126,7 +126,7 @@ def test_the_order_of_edges_does_not_matter() -> None:
 
 
 def test_steps_of_another_graph_are_refused() -> None:
-    with pytest.raises(InputError, match="edge 99 of the steps"):
+    with pytest.raises(InputError, match="edge 99 of the matches"):
         open_braids(graph_from_lines(BRAID, crs=CRS), driven([(99, True)]))
 
 

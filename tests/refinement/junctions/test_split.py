@@ -271,14 +271,14 @@ class TestPositions:
         east = pd.DataFrame({"trace_id": "a", "t": range(9), "x": x, "y": 0.0, "z": 10 + x / 10})
         for table, expected in ((east, [0.0, 0.0, 10.0]), (east.drop(columns="t"), [np.nan] * 3)):
             fleet = fleet_from_tables(table, crs=UTM, target_crs=UTM)
-            found = passing_positions(CROSS, fleet, match(fleet, CROSS))
+            found = passing_positions(CROSS, fleet, match(CROSS, fleet))
             assert found["via_node"].tolist() == [1]
             assert found[["x", "y", "z"]].to_numpy()[0] == pytest.approx(expected, abs=1e-6, nan_ok=True)
 
     def test_far_fixes_say_nothing(self) -> None:
         table = pd.DataFrame({"trace_id": 1, "t": [0, 4], "x": [-80.0, 80.0], "y": 0.0, "z": 5.0})
         fleet = fleet_from_tables(table, crs=UTM, target_crs=UTM)
-        assert passing_positions(CROSS, fleet, match(fleet, CROSS))["z"].isna().all()
+        assert passing_positions(CROSS, fleet, match(CROSS, fleet))["z"].isna().all()
 
     def test_other_graph(self) -> None:
         fleet = fleet_from_tables(
@@ -290,7 +290,7 @@ class TestPositions:
         with pytest.raises(InputError, match="nodes that are not in the graph"):
             passing_positions(replace(other, nodes=other.nodes.iloc[:1]), fleet, matches)
         with pytest.raises(
-            InputError, match=r"edge 1 of the steps is not in the graph; pass the graph that was matched"
+            InputError, match=r"edge 1 of the matches is not in the graph; pass the graph that was matched"
         ):
             node_passages(other, steps_of(CROSS, {(1, 0): 1}))
 

@@ -115,7 +115,7 @@ def run_errors(runs: Runs, chosen: NDArray[np.int64], lines: list[NDArray[np.flo
 
 def _open(graph: RoadGraph) -> _Plan:
     """Take a map apart."""
-    u, v = (graph.nodes.index.get_indexer(graph.edges[end]).tolist() for end in ("u", "v"))
+    u, v = graph.end_rows.T.tolist()
     at_node: list[set[int]] = [set() for _ in graph.nodes.index]
     for segment, nodes in enumerate(zip(u, v, strict=True)):
         for node in nodes:

@@ -75,8 +75,7 @@ def prune_segments(graph: RoadGraph, runs: Runs, *, min_runs: int) -> tuple[Road
 
 def _chain_ids(graph: RoadGraph) -> NDArray[np.int64]:
     """Return for every edge the id that merging nodes of degree 2 gives its chain: that of the first in table order."""
-    u, v = (graph.nodes.index.get_indexer(graph.edges[end]) for end in ("u", "v"))
-    mate = mates(u, v)
+    mate = mates(*graph.end_rows.T)
     if not (mate >= 0).any():
         return graph.edges.index.to_numpy()
     members, _, starts = chains(mate)

@@ -79,12 +79,11 @@ def straight_pieces(graph: RoadGraph) -> Pieces:
     ([0, 1, 1], [[0, 1], [1, 3], [3, 2]])
     """
     xy, owner = shapely.get_coordinates(graph.edges.geometry.to_numpy(), return_index=True)
-    ends = np.stack([graph.nodes.index.get_indexer(graph.edges[end]) for end in ("u", "v")], axis=1)
     last = np.diff(owner, append=-1) != 0
     first = np.roll(last, 1)
     bend = ~(first | last)
     node = np.empty(len(xy), np.int64)
-    node[first], node[last] = ends[:, 0], ends[:, 1]
+    node[first], node[last] = graph.end_rows.T
     node[bend] = len(graph.nodes) + np.arange(bend.sum())
     start = np.flatnonzero(~last)
     lines = shapely.linestrings(np.stack([xy[start], xy[start + 1]], axis=1))

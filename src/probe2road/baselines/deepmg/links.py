@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
@@ -146,9 +145,8 @@ def bearing_difference(
 
 def _edges(graph: RoadGraph, lines: NDArray[np.object_], stub: float) -> _Edges:
     """Take the edges of a graph apart."""
-    row = pd.Series(np.arange(len(graph.nodes)), index=graph.nodes.index)
-    u, v = (row[graph.edges[end]].to_numpy() for end in ("u", "v"))
-    degree = np.bincount(np.concatenate([u, v]), minlength=len(graph.nodes))
+    u, v = graph.end_rows.T
+    degree = np.bincount(graph.end_rows.ravel(), minlength=len(graph.nodes))
     vertices = [shapely.get_coordinates(line) for line in lines]
     along = [np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(part, axis=0).T))]) for part in vertices]
     return _Edges(u, v, vertices, along, (degree[u] == 1) & (degree[v] == 1) & (shapely.length(lines) < stub))

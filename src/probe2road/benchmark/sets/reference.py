@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from probe2road.errors import InputError, OptionError
+from probe2road.graph.ends import end_rows
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.simulation.networks.network import RoadNetwork
 
@@ -100,8 +101,7 @@ def main_roads(network: RoadNetwork, *, main: Sequence[str] = MAIN_ROADS, reach:
     kept = sections["highway"].isin(main).to_numpy()
     if not kept.any():
         return network
-    row = pd.Series(np.arange(len(network.nodes)), index=network.nodes.index)
-    u, v = row[sections["u"]].to_numpy(), row[sections["v"]].to_numpy()
+    u, v = end_rows(network.nodes, sections).T
     away = np.full(len(network.nodes), np.inf)
     away[u[kept]] = away[v[kept]] = 0.0
     length, changed = sections.length.to_numpy(), True

@@ -95,7 +95,7 @@ def fill_gaps(graph: RoadGraph, *, options: GapOptions | None = None) -> RoadGra
     if not len(graph.edges):
         return graph
     lines = shapely.force_2d(graph.edges.geometry.to_numpy())
-    ends = dead_ends(graph, lines, options.heading_length)
+    ends = dead_ends(graph, options.heading_length)
     tree = shapely.STRtree(lines)
     proposed = [
         to_dead_ends(ends, options),
@@ -133,6 +133,11 @@ def fill_jumps(graph: RoadGraph, steps: pd.DataFrame, *, options: GapOptions | N
     -------
     RoadGraph
         The same object where there is nothing to add. As with `fill_gaps`, links are proposals.
+
+    Raises
+    ------
+    InputError
+        If the steps name an edge that is not in the graph.
 
     Examples
     --------

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-import shapely
 from numpy.typing import NDArray
 
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.refinement.gaps.links import GapOptions, angle_between, ends_of_lines
+from probe2road.matching.tables import step_rows
+from probe2road.refinement.gaps.links import GapOptions, angle_between
 
 __all__ = ["jumped_gaps"]
 
@@ -35,6 +35,11 @@ def jumped_gaps(graph: RoadGraph, steps: pd.DataFrame, options: GapOptions) -> N
     ndarray of int64, shape (n, 2)
         Rows of nodes, the smaller first; pairs that an edge joins are left out.
 
+    Raises
+    ------
+    InputError
+        If the steps name an edge that is not in the graph.
+
     Examples
     --------
     Two drives are lost for 60 m:
@@ -46,28 +51,20 @@ def jumped_gaps(graph: RoadGraph, steps: pd.DataFrame, options: GapOptions) -> N
     array([[1, 2]])
     """
     trace, forward = steps["trace_id"].to_numpy(), steps["forward"].to_numpy(bool)
-    edge = graph.edges.index.get_indexer(steps["edge"])
+    edge = step_rows(graph, steps, where="fill_jumps")
     entered, left = (steps[name].to_numpy(bool) for name in ("entered", "left"))
     off = np.flatnonzero((trace[1:] == trace[:-1]) & ~left[:-1] & ~entered[1:])
-    reach = options.heading_length
-    node, position, ahead = _ends(graph, edge[off], at_start=~forward[off], reach=reach)
-    other, there, back = _ends(graph, edge[off + 1], at_start=forward[off + 1], reach=reach)
-    link = there - position
+    ends = graph.ends(reach=options.heading_length)
+    lost, found_again = 2 * edge[off] + forward[off], 2 * edge[off + 1] + ~forward[off + 1]
+    link = ends.position[found_again] - ends.position[lost]
     distance = np.hypot(*link.T)
-    turn = np.maximum(angle_between(ahead, link), angle_between(-back, link))
-    fits = (node != other) & (distance > 0) & (distance <= options.max_jump) & (turn <= options.jump_turn)
-    pairs = np.sort(np.stack([node, other], axis=1)[fits], axis=1)
+    turn = np.maximum(angle_between(-ends.ahead[lost], link), angle_between(ends.ahead[found_again], link))
+    pairs = np.sort(np.stack([ends.node[lost], ends.node[found_again]], axis=1), axis=1)
+    fits = (pairs[:, 0] != pairs[:, 1]) & (distance > 0)
+    fits &= (distance <= options.max_jump) & (turn <= options.jump_turn)
+    pairs = pairs[fits]
     jumps = pd.DataFrame({"one": pairs[:, 0], "other": pairs[:, 1], "trace": trace[off[fits]]})
     traces = jumps.groupby(["one", "other"])["trace"].nunique()
-    joined = np.sort(graph.nodes.index.get_indexer(graph.edges[["u", "v"]].to_numpy().ravel()).reshape(-1, 2), axis=1)
+    joined = np.sort(graph.end_rows, axis=1)
     found = traces.index[(traces >= options.min_jumps) & ~traces.index.isin(pd.MultiIndex.from_arrays(joined.T))]
     return np.array(found.to_list(), np.int64).reshape(-1, 2)
-
-
-def _ends(
-    graph: RoadGraph, edge: NDArray[np.int64], *, at_start: NDArray[np.bool_], reach: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Look up ends by rows of edges: rows of their nodes ``(n,)``, positions and directions (m) ``(n, 2)``."""
-    node = np.where(at_start, *(graph.edges[end].to_numpy()[edge] for end in ("u", "v")))
-    lines = shapely.force_2d(graph.edges.geometry.to_numpy()[edge])
-    return graph.nodes.index.get_indexer(node).astype(np.int64), *ends_of_lines(lines, at_start, reach)

@@ -28,7 +28,6 @@ __all__ = [
     "angle_between",
     "crosses",
     "dead_ends",
-    "ends_of_lines",
     "straight_on",
     "to_dead_ends",
     "to_edges_beside",
@@ -87,45 +86,15 @@ class Links:
         return Links(*(getattr(self, field.name)[kept] for field in fields(self)))
 
 
-def ends_of_lines(
-    lines: NDArray[np.object_], at_start: NDArray[np.bool_], reach: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return one end of each line and the vector that leads there from within, over a length or all of it.
+def dead_ends(graph: RoadGraph, reach: float) -> DeadEnds:
+    """Collect the ends of edges at nodes of degree 1, their directions measured over a length (m) or the whole edge.
 
-    Parameters
-    ----------
-    lines
-        In plan, shape ``(n,)``.
-    at_start
-        Which end, shape ``(n,)``.
-    reach
-        The length, m.
-
-    Returns
-    -------
-    position, ahead
-        Metres, shape ``(n, 2)`` each; a vector is zero where its line comes back to its end.
+    An edge that curls back onto its end within that length has no direction there, and is left out.
     """
-    length = shapely.length(lines)
-    tip = np.where(at_start, 0.0, length)
-    inner = np.where(at_start, np.minimum(reach, length), np.maximum(length - reach, 0.0))
-    position, inside = (shapely.get_coordinates(shapely.line_interpolate_point(lines, along)) for along in (tip, inner))
-    return position, position - inside
-
-
-def dead_ends(graph: RoadGraph, lines: NDArray[np.object_], reach: float) -> DeadEnds:
-    """Collect the ends of edges at nodes of degree 1."""
-    row = pd.Series(np.arange(len(graph.nodes)), index=graph.nodes.index)
-    node = np.stack([row[graph.edges[end]].to_numpy() for end in ("u", "v")])
-    degree = np.bincount(node.ravel(), minlength=len(graph.nodes))
-    side, edge = np.nonzero(degree[node] == 1)
-    at_start = side == 0
-    position, ahead = ends_of_lines(lines[edge], at_start, reach)
-    # An edge that curls back onto its end within the reach has no direction; it is left out.
-    norm = np.hypot(*ahead.T)
-    kept = norm > 0
-    ahead = ahead[kept] / norm[kept, None]
-    return DeadEnds(edge[kept], node[side, edge][kept], at_start[kept], position[kept], ahead)
+    ends = graph.ends(reach=reach)
+    degree = np.bincount(ends.node, minlength=len(graph.nodes))
+    end = np.flatnonzero((degree[ends.node] == 1) & ends.ahead.any(axis=1))
+    return DeadEnds(end // 2, ends.node[end], end % 2 == 0, ends.position[end], -ends.ahead[end])
 
 
 def to_dead_ends(ends: DeadEnds, options: GapOptions) -> Links:
@@ -174,27 +143,50 @@ def to_edges_beside(
 
     A ramp's end is nearly parallel to the mainline. Its straight extension would reach it far ahead, or never.
     """
-    end, edge = tree.query(shapely.points(ends.position), predicate="dwithin", distance=options.beside)
-    nearest = shapely.line_interpolate_point(
-        lines[edge], shapely.line_locate_point(lines[edge], shapely.points(ends.position[end]))
-    )
-    to_edge = shapely.get_coordinates(nearest).reshape(-1, 2) - ends.position[end]
-    aside = np.hypot(*to_edge.T)
+    near = _edges_near(lines, tree, ends, options.beside)
+    runs_along = _runs_along(lines, ends, near)
+    runs_along &= _apart_on_edge(lines, ends, near.end, near.edge, near.along, options.max_length)
+    order = np.flatnonzero(runs_along)
+    order = order[np.lexsort([*near.target[order].T, near.aside[order], near.end[order]])]
+    nearest = order[_heads(near.end[order])]
+    return _snapped(graph, lines, near.end[nearest], near.edge[nearest], near.along[nearest], options.snap)
+
+
+@dataclass(frozen=True)
+class _EdgesNear:
+    """n pairs of a dead end and an edge near it."""
+
+    end: NDArray[np.int64]  # (n,) row of the dead end
+    edge: NDArray[np.int64]  # (n,) row of the edge
+    foot: NDArray[np.float64]  # (n, 2) m, from the dead end to the nearest place of the edge
+    aside: NDArray[np.float64]  # (n,) m, length of that
+    along: NDArray[np.float64]  # (n,) m from the start of the edge, where a link would lead
+    target: NDArray[np.float64]  # (n, 2) m, that place
+
+
+def _edges_near(lines: NDArray[np.object_], tree: shapely.STRtree, ends: DeadEnds, distance: float) -> _EdgesNear:
+    """Pair dead ends with the edges up to a distance (m) from them, and find where links would lead."""
+    points = shapely.points(ends.position)
+    end, edge = tree.query(points, predicate="dwithin", distance=distance)
+    nearest = shapely.line_interpolate_point(lines[edge], shapely.line_locate_point(lines[edge], points[end]))
+    foot = shapely.get_coordinates(nearest).reshape(-1, 2) - ends.position[end]
+    aside = np.hypot(*foot.T)
     ahead = shapely.points(ends.position[end] + _LEAD * aside[:, None] * ends.ahead[end])
     along = shapely.line_locate_point(lines[edge], ahead)
     target = shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], along))
-    slope = angle_between(ends.ahead[end], _directions(lines[edge], along))
-    kept = (
-        (aside > _TOUCH)
-        & (angle_between(ends.ahead[end], to_edge) >= _ALONG)  # else it is ahead, not beside
+    return _EdgesNear(end, edge, foot, aside, along, target)
+
+
+def _runs_along(lines: NDArray[np.object_], ends: DeadEnds, near: _EdgesNear) -> NDArray[np.bool_]:
+    """Tell which edges run along the dead end beside them, shape (n,)."""
+    ahead = ends.ahead[near.end]
+    slope = angle_between(ahead, _directions(lines[near.edge], near.along))
+    return np.asarray(
+        (near.aside > _TOUCH)
+        & (angle_between(ahead, near.foot) >= _ALONG)  # else it is ahead, not beside
         & (np.minimum(slope, 180.0 - slope) <= _ALONG)
-        & (angle_between(ends.ahead[end], target - ends.position[end]) <= _ALONG)
-        & _apart_on_edge(lines, ends, end, edge, along, options.max_length)
+        & (angle_between(ahead, near.target - ends.position[near.end]) <= _ALONG)
     )
-    order = np.flatnonzero(kept)
-    order = order[np.lexsort([*target[order].T, aside[order], end[order]])]
-    nearest = order[_heads(end[order])]
-    return _snapped(graph, lines, end[nearest], edge[nearest], along[nearest], options.snap)
 
 
 def _apart_on_edge(
@@ -223,8 +215,7 @@ def _snapped(
     length = shapely.length(lines[edge])
     at_start = along <= length - along
     snapped = np.minimum(along, length - along) <= snap
-    name = graph.edges[["u", "v"]].to_numpy()[edge, np.where(at_start, 0, 1)]
-    node = np.where(snapped, graph.nodes.index.get_indexer(name), NO_NODE)
+    node = np.where(snapped, graph.end_rows[edge, np.where(at_start, 0, 1)], NO_NODE)
     along = np.where(snapped, np.where(at_start, 0.0, length), along)
     target = shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], along)).reshape(-1, 2)
     return Links(end, node, edge, along, target)
@@ -253,9 +244,8 @@ def crosses(graph: RoadGraph, tree: shapely.STRtree, ends: DeadEnds, links: Link
         np.stack([start + vector * (_TOUCH / length), links.target - vector * (_TOUCH / length)], axis=1)
     )
     link, edge = tree.query(body, predicate="intersects")
-    name = graph.nodes.index.to_numpy()
-    at_target = (graph.edges[["u", "v"]].to_numpy()[edge] == name[links.node[link]][:, None]).any(axis=1)
-    asked = ~(at_target & (links.node[link] != NO_NODE)) & ~((links.node[link] == NO_NODE) & (links.edge[link] == edge))
+    at_target = (graph.end_rows[edge] == links.node[link][:, None]).any(axis=1)
+    asked = ~at_target & ~((links.node[link] == NO_NODE) & (links.edge[link] == edge))
     crosses = np.zeros(len(links.end), bool)
     crosses[link[asked]] = True
     return crosses

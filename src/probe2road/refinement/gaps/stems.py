@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.refinement.gaps.links import GapOptions, angle_between, ends_of_lines
+from probe2road.refinement.gaps.links import GapOptions, angle_between
 
 __all__ = ["facing_stems"]
 
@@ -79,28 +79,25 @@ def _stems(
     graph: RoadGraph, reach: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Collect the edge ends that nothing continues: node row, position, direction out of the road, at a junction."""
-    lines = shapely.force_2d(graph.edges.geometry.to_numpy())
-    row = pd.Series(np.arange(len(graph.nodes)), index=graph.nodes.index)
-    node = np.concatenate([row[graph.edges[end]].to_numpy() for end in ("u", "v")])
-    at_start = np.arange(len(node)) < len(lines)
-    position, ahead = ends_of_lines(np.concatenate([lines, lines]), at_start, reach)
+    measured = graph.ends(reach=reach)
+    node, position, ahead = measured.node, measured.position, -measured.ahead
     ends = pd.DataFrame({"node": node, "end": np.arange(len(node))})
     met = ends.merge(ends, on="node", suffixes=("", "_other"))
     met = met[met["end"] != met["end_other"]]
     straight = angle_between(ahead[met["end"]], -ahead[met["end_other"]]) <= _CONTINUED
     continued = np.isin(ends["end"], met["end"][straight])
     degree = np.bincount(node, minlength=len(graph.nodes))[node]
-    kept = ~continued & (np.hypot(*ahead.T) > 0) & (degree != 2)
+    kept = ~continued & ahead.any(axis=1) & (degree != 2)
     return node[kept], position[kept], ahead[kept], degree[kept] > 2
 
 
 def _joined(graph: RoadGraph, links: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Tell which links have an edge between their nodes that is hardly longer."""
-    name, place = graph.nodes.index.to_numpy(), shapely.get_coordinates(graph.nodes.geometry.to_numpy())
-    ends = np.sort(graph.nodes.index.get_indexer(graph.edges[["u", "v"]].to_numpy().ravel()).reshape(-1, 2), axis=1)
+    place = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
+    ends = np.sort(graph.end_rows, axis=1)
     shortest = graph.edges["length"].groupby([ends[:, 0], ends[:, 1]]).min()
     length = shortest.reindex(pd.MultiIndex.from_arrays(links.T)).to_numpy() if len(links) else np.zeros(0)
-    away = np.hypot(*(place[links[:, 1]] - place[links[:, 0]]).T) if len(name) else np.zeros(0)
+    away = np.hypot(*(place[links[:, 1]] - place[links[:, 0]]).T) if len(place) else np.zeros(0)
     return np.asarray(length <= _DETOUR * away)
 
 
@@ -109,8 +106,7 @@ def _crossing(graph: RoadGraph, links: NDArray[np.int64]) -> NDArray[np.bool_]:
     place = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
     bodies = shapely.linestrings(place[links]) if len(links) else np.zeros(0, object)
     link, edge = shapely.STRtree(graph.edges.geometry.to_numpy()).query(bodies, predicate="intersects")
-    ends = graph.edges[["u", "v"]].to_numpy()[edge]
-    own = (ends[:, :, None] == graph.nodes.index.to_numpy()[links[link]][:, None, :]).any(axis=(1, 2))
+    own = (graph.end_rows[edge][:, :, None] == links[link][:, None, :]).any(axis=(1, 2))
     crossing = np.zeros(len(links), bool)
     crossing[link[~own]] = True
     return crossing

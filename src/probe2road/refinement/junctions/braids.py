@@ -33,15 +33,15 @@ from probe2road.graph.clean import merge_degree_two_nodes
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.splitting import led_to
 from probe2road.graph.tables import finish_edges
-from probe2road.graph.topology import directions_away, end_nodes
+from probe2road.matching.tables import step_rows
 from probe2road.options import checked
-from probe2road.refinement.junctions.passages import step_rows
 
 __all__ = ["BraidOptions", "open_braids"]
 
 logger = logging.getLogger(__name__)
 
 _NEAR, _FAR = 8.0, 30.0  # m from a node between which the direction of an edge is measured
+_SHARE = 0.9  # of a short edge, up to which it is measured
 _STEP = 5.0  # m between the points of new lines
 _SMOOTH = 25.0  # m over which the middle of a chain is averaged
 _TRIM = 15.0  # m; cut off a road beside a chain, where it has been bent to the first joint
@@ -117,16 +117,16 @@ def open_braids(graph: RoadGraph, steps: pd.DataFrame, *, options: BraidOptions 
     if not options.max_inner or graph.edges.empty:
         return graph
     lines = shapely.force_2d(graph.edges.geometry.to_numpy())
-    u, v = (graph.nodes.index.get_indexer(graph.edges[end]).astype(np.int64) for end in ("u", "v"))
     ways = _ways(graph, steps)
     out, into = ways.ravel(), ways[:, ::-1].ravel()  # of every end: away from its node, towards it
     changed = _Changes(graph)
     shared = ways.min(axis=1) >= np.maximum(options.min_traces, (1.0 - options.min_share) * ways.sum(axis=1))
     longest = np.where(shared, options.max_shared, options.max_inner)
     short = shapely.length(lines) <= longest
-    for chain in _chains(lines, u, v, short, shapely.get_coordinates(graph.nodes.geometry.to_numpy()), options):
+    joint = _joints(graph, options.max_angle)
+    for chain in _chains(graph, joint, short & joint[graph.end_rows].all(axis=1)):
         roads = _roads(chain, into[chain.ends], out[chain.ends], options)
-        middle = _middle(chain, roads, lines, u, v) if roads else None
+        middle = _middle(chain, roads, lines, graph.end_rows) if roads else None
         if middle is None or _width(lines[chain.inner], middle) > options.max_width:
             continue
         left = _offsets(roads, lines, middle, options)
@@ -146,39 +146,48 @@ def _ways(graph: RoadGraph, steps: pd.DataFrame) -> NDArray[np.int64]:
     return np.bincount(2 * row + backwards, minlength=2 * len(graph.edges)).reshape(-1, 2)
 
 
-def _chains(
-    lines: NDArray[np.object_],
-    u: NDArray[np.int64],
-    v: NDArray[np.int64],
-    short: NDArray[np.bool_],
-    places: NDArray[np.float64],
-    options: BraidOptions,
-) -> Iterator[_Chain]:
-    """Yield the sets of two joints and more that short edges connect, from which edges lead to two sides."""
-    node = end_nodes(u, v)
-    n = len(places)
-    angle = np.arctan2(*directions_away(lines, _NEAR, _FAR).T[::-1])
+def _joints(graph: RoadGraph, max_angle: float) -> NDArray[np.bool_]:
+    """Tell which nodes have three edge ends and more that all lie along one line (to so many degrees), shape (N,)."""
+    ends, n_nodes = graph.ends(reach=_FAR, skip=_NEAR, share=_SHARE), len(graph.nodes)
+    angle = np.arctan2(ends.ahead[:, 1], ends.ahead[:, 0])
     # Opposite directions are one line: of the doubled angles the mean is taken.
-    sums = [np.bincount(node, wave(2.0 * angle), n) for wave in (np.sin, np.cos)]
-    aside = np.abs((angle - np.arctan2(*sums)[node] / 2.0 + np.pi / 2.0) % np.pi - np.pi / 2.0)
-    worst = np.zeros(n)
-    np.maximum.at(worst, node, aside)
-    joint = (np.bincount(node, minlength=n) >= 3) & (worst <= np.radians(options.max_angle))
-    inner = short & joint[u] & joint[v]
-    links = coo_array((np.ones(inner.sum()), (u[inner], v[inner])), shape=(n, n))
-    part = connected_components(links, directed=False)[1]
-    size = np.bincount(part, minlength=n)
-    ends = pd.Series(np.arange(2 * len(lines)))[joint[node] & (size[part[node]] > 1)]
-    for _, own in ends.groupby(part[node[ends]]):
-        own = own.to_numpy()
-        away = own[~inner[own // 2]]
-        nodes = np.unique(node[own])
-        apart = np.hypot(*(places[nodes][:, None] - places[nodes]).T)
-        first, last = np.unravel_index(apart.argmax(), apart.shape)
-        to_first, to_last = (np.hypot(*(places[node[away]] - places[nodes[end]]).T) for end in (first, last))
-        side = (to_last < to_first).astype(np.int64)
+    sums = [np.bincount(ends.node, wave(2.0 * angle), n_nodes) for wave in (np.sin, np.cos)]
+    line = np.arctan2(*sums) / 2.0
+    aside = np.abs((angle - line[ends.node] + np.pi / 2.0) % np.pi - np.pi / 2.0)
+    worst = np.zeros(n_nodes)
+    np.maximum.at(worst, ends.node, aside)
+    return (np.bincount(ends.node, minlength=n_nodes) >= 3) & (worst <= np.radians(max_angle))
+
+
+def _chains(graph: RoadGraph, joint: NDArray[np.bool_], inner: NDArray[np.bool_]) -> Iterator[_Chain]:
+    """Yield the sets of two joints and more that inner edges connect, from which edges lead to two sides."""
+    node = graph.end_rows.ravel()
+    places = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
+    for ends in _ends_by_part(graph, joint, inner):
+        is_inner = inner[ends // 2]
+        leading, joints = ends[~is_inner], np.unique(node[ends])
+        side = _sides(places[joints], places[node[leading]])
         if 0 < side.sum() < len(side):
-            yield _Chain(nodes, np.unique(own[inner[own // 2]] // 2), away, side)
+            yield _Chain(joints, np.unique(ends[is_inner] // 2), leading, side)
+
+
+def _ends_by_part(graph: RoadGraph, joint: NDArray[np.bool_], inner: NDArray[np.bool_]) -> Iterator[NDArray[np.int64]]:
+    """Yield the edge ends at each set of two joints and more that inner edges connect."""
+    node, n_nodes = graph.end_rows.ravel(), len(graph.nodes)
+    links = coo_array((np.ones(inner.sum()), tuple(graph.end_rows[inner].T)), shape=(n_nodes, n_nodes))
+    part = connected_components(links, directed=False)[1]
+    size = np.bincount(part, minlength=n_nodes)
+    ends = np.flatnonzero(joint[node] & (size[part[node]] > 1))
+    for _, members in pd.Series(ends).groupby(part[node[ends]]):
+        yield members.to_numpy()
+
+
+def _sides(joints: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Say for each place (m) which of the two joints farthest apart is nearer: 0 or 1."""
+    apart = np.hypot(*(joints[:, None] - joints).T)
+    first, last = np.unravel_index(apart.argmax(), apart.shape)
+    to_first, to_last = (np.hypot(*(places - joints[joint]).T) for joint in (first, last))
+    return (to_last < to_first).astype(np.int64)
 
 
 def _roads(
@@ -202,13 +211,12 @@ def _middle(
     chain: _Chain,
     roads: list[tuple[int, int]],
     lines: NDArray[np.object_],
-    u: NDArray[np.int64],
-    v: NDArray[np.int64],
+    rows: NDArray[np.int64],
 ) -> NDArray[np.float64] | None:
     """Find points along the middle of a chain (m, 2), in the direction of its first road; None if nothing leads on."""
-    node = end_nodes(u, v)
+    node = rows.ravel()
     came, went = roads[0]
-    way = _way_through(chain, lines, u, v, int(node[came]), int(node[went]))
+    way = _way_through(chain, lines, rows, int(node[came]), int(node[went]))
     if way is None:
         return None
     count = max(round(way.length / _STEP), 2) + 1
@@ -226,7 +234,7 @@ def _middle(
 
 
 def _way_through(
-    chain: _Chain, lines: NDArray[np.object_], u: NDArray[np.int64], v: NDArray[np.int64], start: int, stop: int
+    chain: _Chain, lines: NDArray[np.object_], rows: NDArray[np.int64], start: int, stop: int
 ) -> shapely.LineString | None:
     """Find the shortest way from joint to joint along the edges of a chain."""
     at = {int(node): k for k, node in enumerate(chain.nodes)}
@@ -234,7 +242,7 @@ def _way_through(
     length = np.full((n, n), np.inf)
     edge = np.full((n, n), -1)
     for row in chain.inner.tolist():
-        a, b = at[int(u[row])], at[int(v[row])]
+        a, b = (at[int(node)] for node in rows[row])
         if lines[row].length < length[a, b]:
             length[a, b] = length[b, a] = lines[row].length
             edge[a, b] = edge[b, a] = row
@@ -246,7 +254,7 @@ def _way_through(
             return None
         row = edge[last, here]
         part = shapely.get_coordinates(lines[row])
-        points.append(part if at[int(v[row])] == here else part[::-1])
+        points.append(part if at[int(rows[row, 1])] == here else part[::-1])
         here = last
     return shapely.LineString(np.concatenate(points[::-1])) if points else None
 

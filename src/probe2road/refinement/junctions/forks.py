@@ -19,7 +19,7 @@ Legend of array shapes: E edges, F forks, B bins, n fixes. Ends of edges are num
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -33,7 +33,6 @@ from probe2road.bounds import NotNegative
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import finish_edges
-from probe2road.graph.topology import directions_away, end_nodes
 from probe2road.matching.frame import FramedFixes, Traversals, frame
 from probe2road.matching.match import Matches
 from probe2road.options import checked
@@ -43,6 +42,7 @@ __all__ = ["ForkOptions", "Forks", "find_forks", "move_forks"]
 logger = logging.getLogger(__name__)
 
 _NEAR, _FAR = 10.0, 40.0  # m from a junction between which the direction of a road is measured
+_SHARE = 0.9  # of a short road, up to which it is measured
 _STRAIGHT = -0.75  # cosine between the common road and the mean of both branches, at most
 _BIN = 5.0  # m along the common road
 _STEP = 2.5  # m between bends that are tried
@@ -151,10 +151,10 @@ def find_forks(graph: RoadGraph, *, max_angle: float = ForkOptions.max_angle) ->
     >>> forks.node.tolist(), forks.stem.tolist(), forks.branch.tolist()
     ([1], [1], [[2, 4]])
     """
-    ahead = directions_away(graph.edges.geometry.to_numpy(), _NEAR, _FAR)
-    row = graph.nodes.index.get_indexer(end_nodes(graph.edges["u"].to_numpy(), graph.edges["v"].to_numpy()))
-    order = np.argsort(row, kind="stable")
-    node, first, count = np.unique(row[order], return_index=True, return_counts=True)
+    measured = graph.ends(reach=_FAR, skip=_NEAR, share=_SHARE)
+    ahead = measured.ahead
+    order = np.argsort(measured.node, kind="stable")
+    node, first, count = np.unique(measured.node[order], return_index=True, return_counts=True)
     ends = order[first[count == 3][:, None] + np.arange(3)]  # (N, 3)
     node = node[count == 3]
     pairs = np.array([(0, 1), (0, 2), (1, 2)])
@@ -166,7 +166,7 @@ def find_forks(graph: RoadGraph, *, max_angle: float = ForkOptions.max_angle) ->
     onward = (ahead[stem] * middle).sum(axis=1)
     three = (np.diff(np.sort(ends // 2, axis=1), axis=1) > 0).all(axis=1)
     fork = three & (cosine[every, best] >= np.cos(np.radians(max_angle))) & (onward <= _STRAIGHT)
-    return Forks(node[fork].astype(np.int64), stem[fork], branch[fork])
+    return Forks(node[fork], stem[fork], branch[fork])
 
 
 def _distances(
@@ -227,27 +227,56 @@ def _bends(apart: NDArray[np.float64], count: NDArray[np.int64], options: ForkOp
     return bend
 
 
+@dataclass(frozen=True)
+class _Lane:
+    """A lane of its own that leads to a fork; all m along the common road, away from the fork."""
+
+    end: float  # where it ends
+    length: float
+    change: float  # over which traces change to it, behind its length
+
+    def rises(self, at: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Return what distances of traces are made of at places ``(B,)``: the lane, and the rise behind its end."""
+        to_lane = np.clip((self.end + self.length + self.change - at) / self.change, 0.0, 1.0)
+        return [to_lane, np.maximum(self.end - at, 0.0)] if self.end else [to_lane]
+
+
 def _lane_ends(
     apart: NDArray[np.float64], count: NDArray[np.int64], bend: NDArray[np.float64], options: ForkOptions
 ) -> NDArray[np.float64]:
     """Bends (m), ``(F,)``, and where two rises with a lane between them fit the distances much better, its end."""
     bend = bend.copy()
-    some = np.flatnonzero(bend)
-    at, weight, value = _weighted(apart[some], count[some], options)
+    bent = np.flatnonzero(bend)
+    at, weight, value = _weighted(apart[bent], count[bent], options)
     one_rise = np.min([_fit([np.maximum(place - at, 0.0)], weight, value)[1] for place in _places(options)], axis=0)
-    least, end = np.full(len(some), np.inf), np.zeros(len(some))
-    for start, length, change in product(_LANE_ENDS, _LANE_LENGTHS, _LANE_CHANGES):
-        if start + length > options.reach - 2.0 * _LEVEL:
-            continue
-        to_lane = np.clip((start + length + change - at) / change, 0.0, 1.0)
-        rises, error = _fit([to_lane, np.maximum(start - at, 0.0)][: 2 if start else 1], weight, value)
+    lane_end, two_rises = _best_lanes(at, weight, value, options)
+    changed = two_rises < _LANE_GAIN * one_rise
+    bend[bent[changed]] = lane_end[changed]
+    return bend
+
+
+def _best_lanes(
+    at: NDArray[np.float64], weight: NDArray[np.float64], value: NDArray[np.float64], options: ForkOptions
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Find the lane that fits the distances at each fork best: its end (m), and the squared errors, ``(F,)`` each.
+
+    The errors are infinite where none fits that is as wide as a lane.
+    """
+    least, lane_end = np.full(len(value), np.inf), np.zeros(len(value))
+    for lane in _lanes(options):
+        rises, error = _fit(lane.rises(at), weight, value)
         width = np.abs(rises[:, 0])
         fits = (width > options.min_lane) & (width < options.max_lane) & (rises[:, 0] * rises[:, -1] >= 0.0)
         better = fits & (error < least)
-        least, end = np.where(better, error, least), np.where(better, start, end)
-    changed = least < _LANE_GAIN * one_rise
-    bend[some[changed]] = end[changed]
-    return bend
+        least, lane_end = np.where(better, error, least), np.where(better, lane.end, lane_end)
+    return lane_end, least
+
+
+def _lanes(options: ForkOptions) -> Iterator[_Lane]:
+    """Yield the lanes that are tried: those behind which enough of the common road is left."""
+    for lane in (_Lane(*sizes) for sizes in product(_LANE_ENDS.tolist(), _LANE_LENGTHS, _LANE_CHANGES)):
+        if lane.end + lane.length <= options.reach - 2.0 * _LEVEL:
+            yield lane
 
 
 def _places(options: ForkOptions) -> NDArray[np.float64]:

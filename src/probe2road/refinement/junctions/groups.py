@@ -6,25 +6,24 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-import shapely
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from probe2road.graph.ends import EdgeEnds
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.refinement.junctions.passages import Passages, Places
 
 __all__ = [
-    "EndDirections",
     "Evidence",
     "GroupingRules",
     "connected_ends",
-    "end_directions",
     "evidence",
     "proven_groups",
 ]
 
 _REACH = 20.0  # m; the direction of an edge end is measured over this length
+_SHARE = 0.5  # of a short edge, over which it is measured at most
 _USUAL_SPREAD = 3.0  # m, of heights between traces, where the data is too little to tell
 _LEAST_SPREAD = 0.5  # m
 _FEWEST = 5  # traces of one pair of ends from which a spread is estimated
@@ -44,14 +43,6 @@ class GroupingRules:
 
 
 @dataclass(frozen=True)
-class EndDirections:
-    """Where the ends of E edges lie and lead; rows are ends."""
-
-    position: NDArray[np.float64]  # (2 E, 2) m
-    ahead: NDArray[np.float64]  # (2 E, 2) unit vector from the junction into the edge
-
-
-@dataclass(frozen=True)
 class Evidence:
     """What was counted between m places; p pairs of places, of which q traces have heights."""
 
@@ -59,21 +50,6 @@ class Evidence:
     pairs: pd.DataFrame  # p rows: one, other (places, one <= other), count (passages, both directions)
     heights: pd.DataFrame  # q rows, sorted by pair: pair, trace, z (m)
     spread: float  # m, standard deviation of heights between traces
-
-
-def end_directions(graph: RoadGraph) -> EndDirections:
-    """Measure positions and directions of all edge ends."""
-    lines = shapely.force_2d(graph.edges.geometry.to_numpy())
-    length = shapely.length(lines)
-    reach = np.minimum(_REACH, length / 2)
-    at = np.stack([np.zeros(len(lines)), length], axis=1)
-    inside = np.stack([reach, length - reach], axis=1)
-    position, tip = (
-        shapely.get_coordinates(shapely.line_interpolate_point(lines[:, None], along).reshape(-1))
-        for along in (at, inside)
-    )
-    vector = tip - position
-    return EndDirections(position, vector / np.maximum(np.hypot(*vector.T), 1e-9)[:, None])
 
 
 def evidence(places: Places, passages: Passages) -> Evidence:
@@ -102,49 +78,30 @@ def connected_ends(found: Evidence, *, min_count: int) -> NDArray[np.int64]:
     return _components(pairs["one"].to_numpy(), pairs["other"].to_numpy(), len(found.places.end))
 
 
-def proven_groups(found: Evidence, directions: EndDirections, rules: GroupingRules) -> NDArray[np.int64]:
+def proven_groups(graph: RoadGraph, found: Evidence, rules: GroupingRules) -> NDArray[np.int64]:
     """Return the group of every place, shape (m,): apart only where traces prove it.
 
     All places of a junction are in one group unless there is proof of two. Numbers of different junctions differ.
     """
-    places, pairs = found.places, found.pairs
-    m = len(places.end)
-    one, other, count = (pairs[name].to_numpy() for name in ("one", "other", "count"))
-    flow = np.bincount(one, count, m) + np.bincount(other, count, m)
-    joined = (one != other) & (count >= rules.min_count)
-    joined &= count >= rules.min_share * np.minimum(flow[one], flow[other])
-    label = _components(one[joined], other[joined], m)
-    proven = np.zeros(m, bool)
-    proven[one[joined]] = proven[other[joined]] = True
-
-    head = np.flatnonzero(np.diff(places.junction, prepend=-1))
-    owner = np.repeat(np.arange(len(head)), np.diff(np.append(head, m)))
-    n_proven = pd.DataFrame({"owner": owner, "label": label})[proven].drop_duplicates()["owner"]
-    asked = np.bincount(n_proven, minlength=len(head)) >= 2
-    light = (one != other) & ~proven[one] & ~proven[other]
-    light_label = _components(one[light], other[light], m)
-    if len(found.heights):
-        asked[owner[one[light]]] = True
-    group = head[owner]
-    bounds = np.searchsorted(found.heights["pair"].to_numpy(), np.arange(len(pairs) + 1))
-    z = found.heights["z"].to_numpy()
-    by_junction = pairs.assign(pair=np.arange(len(pairs))).groupby(owner[one]).indices
-    for junction in np.flatnonzero(asked):
-        stop = head[junction + 1] if junction + 1 < len(head) else m
-        here = slice(int(head[junction]), int(stop))
-        rows = by_junction[junction]
-        local = _Junction(
-            direction=directions.ahead[places.end[here]],
-            position=directions.position[places.end[here]],
-            label=np.where(proven[here], label[here], -1),
-            light=np.where(proven[here], -1, light_label[here]),
-            counts=_count_matrix(one[rows] - here.start, other[rows] - here.start, count[rows], here.stop - here.start),
-            ends=np.stack([one[rows], other[rows]], axis=1) - here.start,
-            heights=[z[bounds[row] : bounds[row + 1]] for row in rows],
-            spread=found.spread,
-        )
-        group[here] = here.start + _parted(local, rules)
+    ends = graph.ends(reach=_REACH, share=_SHARE)
+    labels = _labels(found, _joined_pairs(found, rules))
+    heads = np.flatnonzero(np.diff(found.places.junction, prepend=-1))
+    first = np.append(heads, len(found.places.end))
+    group = np.repeat(heads, np.diff(first))
+    pairs_at = found.pairs.reset_index(drop=True).groupby(group[found.pairs["one"]]).indices
+    for head in _junctions_in_doubt(found, labels, group):
+        places = slice(int(head), int(first[np.searchsorted(heads, head) + 1]))
+        junction = _junction_at(places, pairs_at[head], found, labels, ends)
+        group[places] = places.start + _parted(junction, rules)
     return group
+
+
+@dataclass(frozen=True)
+class _Labels:
+    """What traces connect, at all junctions; numbers of different junctions differ."""
+
+    proven: NDArray[np.int64]  # (m,) group by joined pairs, -1 for places without one
+    unproven: NDArray[np.int64]  # (m,) group of the places without one, by any passage between two such; -1 for others
 
 
 @dataclass(frozen=True)
@@ -153,24 +110,82 @@ class _Junction:
 
     direction: NDArray[np.float64]  # (k, 2) unit vectors into the edges
     position: NDArray[np.float64]  # (k, 2) m
-    label: NDArray[np.int64]  # (k,) group by connected pairs, -1 for ends without one
-    light: NDArray[np.int64]  # (k,) group of the ends without one, by any passage between two such; -1 for all others
+    proven: NDArray[np.int64]  # (k,) as in `_Labels`
+    unproven: NDArray[np.int64]  # (k,) as in `_Labels`
     counts: NDArray[np.int64]  # (k, k) passages, symmetric
     ends: NDArray[np.int64]  # (p, 2)
     heights: list[NDArray[np.float64]]  # p arrays, m
     spread: float  # m
 
 
+def _joined_pairs(found: Evidence, rules: GroupingRules) -> NDArray[np.bool_]:
+    """Tell which pairs of two places enough passages connect, and enough of all at either place, shape (p,)."""
+    one, other, count = (found.pairs[name].to_numpy() for name in ("one", "other", "count"))
+    m = len(found.places.end)
+    flow = np.bincount(one, count, m) + np.bincount(other, count, m)
+    enough = (count >= rules.min_count) & (count >= rules.min_share * np.minimum(flow[one], flow[other]))
+    return np.asarray((one != other) & enough)
+
+
+def _labels(found: Evidence, joined: NDArray[np.bool_]) -> _Labels:
+    """Group places by the pairs that are joined, and those without any by what else was driven."""
+    one, other = (found.pairs[name].to_numpy() for name in ("one", "other"))
+    m = len(found.places.end)
+    is_proven = np.zeros(m, bool)
+    is_proven[one[joined]] = is_proven[other[joined]] = True
+    beside = ~is_proven[one] & ~is_proven[other]
+    by_joined, by_any = (_components(one[pairs], other[pairs], m) for pairs in (joined, beside))
+    return _Labels(np.where(is_proven, by_joined, -1), np.where(is_proven, -1, by_any))
+
+
+def _junctions_in_doubt(found: Evidence, labels: _Labels, head: NDArray[np.int64]) -> NDArray[np.int64]:
+    """List the junctions that may be two, by their first place; ``head``, shape (m,), is that of every place.
+
+    They have two proven groups, or passages between places without proof, which heights might set apart.
+    """
+    proven = np.unique(np.stack([head, labels.proven])[:, labels.proven >= 0], axis=1)[0]
+    groups = np.bincount(proven, minlength=len(head))
+    in_doubt = groups >= 2
+    if len(found.heights):
+        one, other = (found.pairs[name].to_numpy() for name in ("one", "other"))
+        unproven = (one != other) & (labels.unproven[one] >= 0) & (labels.unproven[other] >= 0)
+        in_doubt[head[one[unproven]]] = True
+    return np.flatnonzero(in_doubt)
+
+
+def _junction_at(
+    places: slice, pairs: NDArray[np.int64], found: Evidence, labels: _Labels, ends: EdgeEnds
+) -> _Junction:
+    """Collect what is known of one junction, given by its places and the rows of its pairs."""
+    end = found.places.end[places]
+    table = found.pairs.iloc[pairs]
+    local = table[["one", "other"]].to_numpy() - places.start
+    counts = np.zeros((len(end), len(end)), np.int64)
+    counts[local[:, 0], local[:, 1]] = counts[local[:, 1], local[:, 0]] = table["count"]
+    of_pair, z = found.heights["pair"].to_numpy(), found.heights["z"].to_numpy()
+    low, high = (np.searchsorted(of_pair, pairs, side) for side in ("left", "right"))
+    return _Junction(
+        direction=ends.ahead[end],
+        position=ends.position[end],
+        proven=labels.proven[places],
+        unproven=labels.unproven[places],
+        counts=counts,
+        ends=local,
+        heights=[z[i:j] for i, j in zip(low, high, strict=True)],
+        spread=found.spread,
+    )
+
+
 def _parted(junction: _Junction, rules: GroupingRules) -> NDArray[np.int64]:
     """Return the group of every end of one junction, shape (k,)."""
-    k = len(junction.label)
-    groups = [np.flatnonzero(junction.label == name) for name in np.unique(junction.label[junction.label >= 0])]
+    k = len(junction.proven)
+    groups = _members(junction.proven)
     groups = _without_level_crossings(junction, groups, rules)
-    for light in _light_groups(junction):
-        foreign = max((int(junction.counts[np.ix_(light, group)].sum()) for group in groups), default=0)
-        own = int(junction.counts[np.ix_(light, light)].sum()) // 2
-        if own > foreign and all(_stacked(junction, light, group, rules) for group in groups):
-            groups.append(light)
+    for unproven in _unproven_groups(junction):
+        foreign = max((int(junction.counts[np.ix_(unproven, group)].sum()) for group in groups), default=0)
+        own = int(junction.counts[np.ix_(unproven, unproven)].sum()) // 2
+        if own > foreign and all(_stacked(junction, unproven, group, rules) for group in groups):
+            groups.append(unproven)
     result = np.zeros(k, np.int64)
     if len(groups) < 2:
         return result
@@ -183,11 +198,15 @@ def _parted(junction: _Junction, rules: GroupingRules) -> NDArray[np.int64]:
     return result
 
 
-def _light_groups(junction: _Junction) -> list[NDArray[np.int64]]:
-    """Return the groups of ends without a connected pair that some traces passed between; the most driven first."""
-    groups = [np.flatnonzero(junction.light == name) for name in np.unique(junction.light[junction.light >= 0])]
-    groups = [group for group in groups if len(group) > 1]
+def _unproven_groups(junction: _Junction) -> list[NDArray[np.int64]]:
+    """Return the groups of ends without a joined pair that some traces passed between; the most driven first."""
+    groups = [group for group in _members(junction.unproven) if len(group) > 1]
     return sorted(groups, key=lambda group: -int(junction.counts[np.ix_(group, group)].sum()))
+
+
+def _members(label: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """List the ends of every group, by its number; ends with number -1 are in none."""
+    return [np.flatnonzero(label == name) for name in np.unique(label[label >= 0])]
 
 
 def _without_level_crossings(
@@ -251,14 +270,6 @@ def _components(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> NDA
     """Return the connected component of each of n things that pairs join."""
     matrix = coo_array((np.ones(len(one), bool), (one, other)), shape=(n, n))
     return connected_components(matrix, directed=False)[1].astype(np.int64) if n else np.zeros(0, np.int64)
-
-
-def _count_matrix(
-    one: NDArray[np.int64], other: NDArray[np.int64], count: NDArray[np.int64], k: int
-) -> NDArray[np.int64]:
-    matrix = np.zeros((k, k), np.int64)
-    matrix[one, other] = matrix[other, one] = count
-    return matrix
 
 
 def _spread(heights: pd.DataFrame) -> float:

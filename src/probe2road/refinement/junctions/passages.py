@@ -2,7 +2,7 @@
 
 Strategy
 --------
-An edge has two ends, as in `probe2road.graph.topology`: end ``2 e`` where edge row ``e`` starts, ``2 e + 1`` where it
+An edge has two ends, as in `probe2road.graph.ends`: end ``2 e`` where edge row ``e`` starts, ``2 e + 1`` where it
 stops. A passage is a trace's way over a junction, from the end it arrived by to the end it left by; steps name
 directions, so that loops are not ambiguous. A junction is a node, or an edge short enough to be an artefact together
 with both of its nodes: then the passages over that edge lead from outer end to outer end, and the edge itself is
@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from probe2road.errors import InputError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.graph.topology import end_nodes
 from probe2road.matching.match import Matches
+from probe2road.matching.tables import step_rows
 
 __all__ = [
     "Passages",
@@ -33,7 +33,6 @@ __all__ = [
     "passing_positions",
     "places_around",
     "places_at_nodes",
-    "step_rows",
 ]
 
 _FAR = 60.0  # m; between two fixes farther apart, positions are not interpolated
@@ -80,17 +79,16 @@ class Places:
 
 def places_at_nodes(graph: RoadGraph) -> Places:
     """Return the ends at every node."""
-    node = end_nodes(*_end_rows(graph))
+    node = graph.end_rows.ravel()
     order = np.argsort(node, kind="stable")
     return Places(node[order], order)
 
 
 def places_around(graph: RoadGraph, inner: NDArray[np.int64]) -> Places:
     """Return the ends around edges taken as junctions with their two nodes, without their own ends."""
-    u, v = _end_rows(graph)
     at_nodes = places_at_nodes(graph)
     ends = pd.DataFrame({"node": at_nodes.junction, "end": at_nodes.end})
-    near = pd.DataFrame({"node": np.concatenate([u[inner], v[inner]]), "edge": np.tile(inner, 2)}).merge(ends)
+    near = pd.DataFrame({"node": graph.end_rows[inner].T.ravel(), "edge": np.tile(inner, 2)}).merge(ends)
     near = near[near["end"] // 2 != near["edge"]].sort_values(["edge", "end"])
     return Places(near["edge"].to_numpy(np.int64) + len(graph.nodes), near["end"].to_numpy(np.int64))
 
@@ -168,7 +166,7 @@ def node_passages(graph: RoadGraph, steps: pd.DataFrame, positions: pd.DataFrame
     onto = np.flatnonzero(steps["entered"].to_numpy(bool))
     went = 2 * row + np.where(forward, 0, 1)
     came = 2 * row + np.where(forward, 1, 0)
-    node = end_nodes(*_end_rows(graph))
+    node = graph.end_rows.ravel()
     xyz = np.full((len(onto), 3), np.nan)
     if positions is not None:
         keys = ["trace_id", "position"]
@@ -176,21 +174,6 @@ def node_passages(graph: RoadGraph, steps: pd.DataFrame, positions: pd.DataFrame
         xyz = known[[*"xyz"]].to_numpy(np.float64)
     trace = pd.factorize(steps["trace_id"])[0][onto]
     return Passages(node[went[onto]], came[onto - 1], went[onto], trace, xyz, onto)
-
-
-def step_rows(graph: RoadGraph, steps: pd.DataFrame, *, where: str) -> NDArray[np.int64]:
-    """Return the row of the edge of each step.
-
-    Raises
-    ------
-    InputError
-        If the steps name an edge that is not in the graph; ``where`` is who asks.
-    """
-    row = graph.edges.index.get_indexer(steps["edge"]).astype(np.int64)
-    if (row < 0).any():
-        fault = f"edge {steps['edge'].to_numpy()[row < 0][0]} of the steps is not in the graph"
-        raise InputError(fault, where=where, fix="pass the graph that was matched on")
-    return row
 
 
 def double_passages(
@@ -234,8 +217,7 @@ def double_passages(
     at_ends = np.stack([single.xyz[onto, :2], single.xyz[off, :2]], axis=1)
     backwards = single.went[onto] % 2 == 1
     at_ends[backwards] = at_ends[backwards, ::-1]
-    u, v = _end_rows(graph)
-    near = pd.DataFrame({"node": np.concatenate([u[inner], v[inner]]), "edge": np.tile(inner, 2)})
+    near = pd.DataFrame({"node": graph.end_rows[inner].T.ravel(), "edge": np.tile(inner, 2)})
     past = pd.DataFrame({"node": single.junction, "at": np.arange(len(single.junction))}).merge(near, on="node")
     at, edge = past["at"].to_numpy(), past["edge"].to_numpy()
     outside = (single.came[at] // 2 != edge) & (single.went[at] // 2 != edge)
@@ -243,22 +225,13 @@ def double_passages(
     return Passages.joined(over, beside), at_ends
 
 
-def _end_rows(graph: RoadGraph) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the nodes table at which edges start and stop."""
-    u, v = (graph.nodes.index.get_indexer(graph.edges[end]).astype(np.int64) for end in ("u", "v"))
-    return u, v
-
-
 def _interpolated(
     fleet: Fleet, trace_id: pd.Series, moment: NDArray[np.datetime64], place: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Interpolate traces at places that they passed about some moments; NaN where no fixes are near; shape (n, 3)."""
-    starts = fleet.starts
-    names = pd.Index(fleet.traces["trace_id"].to_numpy()[starts[:-1]])
-    trace = names.get_indexer(trace_id)
-    owner = np.repeat(np.arange(len(names)), np.diff(starts))
+    trace = fleet.ids.get_indexer(trace_id)
     clock = fleet.traces["t"].to_numpy("datetime64[ns]")
-    fixes = pd.DataFrame({"trace": owner, "t": clock}).assign(row=np.arange(len(owner)))
+    fixes = pd.DataFrame({"trace": fleet.owner, "t": clock}).assign(row=np.arange(len(clock)))
     wanted = pd.DataFrame({"trace": trace, "t": moment}).assign(order=np.arange(len(trace))).sort_values("t")
     # The clock of a trace without one is NaT throughout: such fixes can bracket nothing.
     fixes = fixes[~np.isnat(clock)].sort_values("t", kind="stable")

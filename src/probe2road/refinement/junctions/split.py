@@ -28,7 +28,6 @@ from probe2road.options import checked
 from probe2road.refinement.junctions.groups import (
     GroupingRules,
     connected_ends,
-    end_directions,
     evidence,
     proven_groups,
 )
@@ -148,15 +147,14 @@ def split_false_junctions(
 def _guarded(graph: RoadGraph, single: Passages, options: DisambiguateOptions) -> tuple[Passages, RoadGraph, int]:
     """Split with every guard; return the passages that count, the graph, and how many artefacts were removed."""
     rules = GroupingRules(options.min_count, options.min_share, options.min_height, options.confidence)
-    directions = end_directions(graph)
     at_nodes = places_at_nodes(graph)
-    group = proven_groups(evidence(at_nodes, single), directions, rules)
+    group = proven_groups(graph, evidence(at_nodes, single), rules)
 
     inner = _possible_artefacts(graph, options.max_inner)
     double, at_ends = double_passages(graph, single, inner)
     around = places_around(graph, inner)
     found = evidence(around, double)
-    outer_group = proven_groups(found, directions, rules)
+    outer_group = proven_groups(graph, found, rules)
     removed = _artefacts(graph, around, outer_group, double, at_ends, found.spread, options)
 
     # What is one artefact is not also split node by node.

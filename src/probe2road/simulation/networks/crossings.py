@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from probe2road.graph.ends import end_rows
 from probe2road.simulation.networks.network import RoadNetwork
 
 __all__ = ["ORDER_RULES", "Crossings", "find_crossings"]
@@ -119,9 +120,8 @@ def _crossing_points(network: RoadNetwork, lines: NDArray[np.object_]) -> pd.Dat
     is_point = shapely.get_type_id(parts) == shapely.GeometryType.POINT
     parts, pair = parts[is_point], pair[is_point]
     i, j, xy = i[pair], j[pair], shapely.get_coordinates(parts)
-    ends = network.sections[["u", "v"]].to_numpy()
-    place = pd.DataFrame(network.nodes.geometry.get_coordinates())
-    position = place.loc[ends.ravel()].to_numpy().reshape(-1, 2, 2)
+    ends = end_rows(network.nodes, network.sections)
+    position = shapely.get_coordinates(network.nodes.geometry.to_numpy())[ends]
     at_node = np.zeros(len(i), dtype=bool)
     for a in (0, 1):
         for b in (0, 1):
@@ -227,10 +227,9 @@ def _near_by_road(
     """Tell which places on two sections are within ramp reach of each other along the roads."""
     if not len(i):
         return np.zeros(0, dtype=bool)
-    nodes = pd.Index(network.nodes.index)
-    ends = np.stack([nodes.get_indexer(network.sections[end]) for end in ("u", "v")], axis=1)
+    ends = end_rows(network.nodes, network.sections)
     length = shapely.length(lines)
-    size = len(nodes)
+    size = len(network.nodes)
     shortest = pd.DataFrame({"a": ends[:, 0], "b": ends[:, 1], "length": length}).groupby(["a", "b"])["length"].min()
     a, b = (shortest.index.get_level_values(level).to_numpy() for level in (0, 1))
     roads = sparse.csr_array((shortest.to_numpy(), (a, b)), shape=(size, size))

@@ -20,6 +20,7 @@ from pyproj import CRS
 
 from probe2road.crs import parse_crs, require_metric
 from probe2road.errors import InputError, OptionError
+from probe2road.graph.ends import line_ends
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.simulation.networks.road_classes import CLASS_DEFAULTS, MarkingStyle, marking_style
@@ -184,11 +185,8 @@ class RoadNetwork:
 
     def _directed_ends(self) -> pd.DataFrame:
         """One row for each section and driving direction: its end nodes, and its headings there (degrees)."""
-        geometry = self.sections.geometry.to_numpy()
-        reach = np.minimum(_HEADING_REACH, shapely.length(geometry))
-        first, last = shapely.get_point(geometry, 0), shapely.get_point(geometry, -1)
-        start = _heading(first, shapely.line_interpolate_point(geometry, reach))
-        end = _heading(shapely.line_interpolate_point(geometry, shapely.length(geometry) - reach), last)
+        _, away = line_ends(self.sections.geometry.to_numpy(), reach=_HEADING_REACH)
+        start, end = _heading(away[0::2]), _heading(-away[1::2])
         table = {"section": self.sections.index.to_numpy(), "u": self.sections["u"].to_numpy()}
         table |= {"v": self.sections["v"].to_numpy(), "start": start, "end": end}
         forward = pd.DataFrame(table).assign(direction=1)
@@ -386,6 +384,6 @@ def _nodes_at_ends(
     return nodes, shapely.linestrings(xyz, indices=owner)
 
 
-def _heading(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
-    """Heading from points a to points b, degrees clockwise from north."""
-    return np.degrees(np.arctan2(shapely.get_x(b) - shapely.get_x(a), shapely.get_y(b) - shapely.get_y(a))) % 360.0
+def _heading(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Heading of vectors, shape ``(n, 2)``, degrees clockwise from north."""
+    return np.degrees(np.arctan2(vector[:, 0], vector[:, 1])) % 360.0

@@ -9,6 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.bounds import NotNegative, Positive
+from probe2road.graph.ends import end_rows
 from probe2road.options import checked
 from probe2road.simulation.networks.network import RoadNetwork
 from probe2road.simulation.networks.road_classes import CLASS_DEFAULTS
@@ -39,12 +40,10 @@ class HeightOptions:
 
 def vertex_unknowns(network: RoadNetwork, offsets: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the unknown of every vertex: node rows first, then the inner vertices of all sections."""
-    rows = pd.Index(network.nodes.index)
     inner = np.ones(offsets[-1], dtype=bool)
     inner[offsets[:-1]], inner[offsets[1:] - 1] = False, False
-    unknown = np.cumsum(inner) - 1 + len(rows)
-    unknown[offsets[:-1]] = rows.get_indexer(network.sections["u"])
-    unknown[offsets[1:] - 1] = rows.get_indexer(network.sections["v"])
+    unknown = np.cumsum(inner) - 1 + len(network.nodes)
+    unknown[offsets[:-1]], unknown[offsets[1:] - 1] = end_rows(network.nodes, network.sections).T
     return unknown.astype(np.int64)
 
 
