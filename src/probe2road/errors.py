@@ -2,17 +2,25 @@
 
 Every message answers three questions: what is wrong, where it is, what to do about it. The command line
 prints that message and exits with code 2; a traceback therefore always means a defect in probe2road.
+
+An error is also the error of Python that says the same, so that a program which knows nothing of probe2road catches
+it where it expects it: bad data and bad options are `ValueError`, an output that cannot be written is an `OSError`, a
+file that is not there is a `FileNotFoundError`, and a package that is not there is an `ImportError`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import errno
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
+from typing import Any
 
 __all__ = [
     "CRSError",
     "InputError",
     "MissingExtraError",
+    "MissingFileError",
     "OptionError",
     "OutputError",
     "Probe2RoadError",
@@ -44,8 +52,16 @@ class Probe2RoadError(Exception):
         suffix = "" if fix is None else f"; {fix}"
         super().__init__(f"{prefix}{what}{suffix}")
 
+    def __str__(self) -> str:
+        # An OSError would put its number in front.
+        return str(self.args[0])
 
-class InputError(Probe2RoadError):
+    def __reduce__(self) -> tuple[Callable[..., Probe2RoadError], tuple[str], dict[str, Any]]:
+        # From its parts, so that an error of a worker process arrives as it was raised.
+        return partial(type(self), where=self.where, fix=self.fix), (self.what,), self.__dict__
+
+
+class InputError(Probe2RoadError, ValueError):
     """The user's data is bad.
 
     Examples
@@ -71,11 +87,30 @@ class CRSError(InputError):
     """A coordinate reference system is missing, in degrees where metres are needed, or contradictory."""
 
 
-class OptionError(Probe2RoadError):
+class MissingFileError(InputError, FileNotFoundError):
+    """A file of the user's data is not there.
+
+    Examples
+    --------
+    >>> try:
+    ...     raise MissingFileError("there is no such file", where="drives.csv")
+    ... except FileNotFoundError as error:
+    ...     print(error)
+    drives.csv: there is no such file
+    """
+
+    def __init__(self, what: str, *, where: object = None, fix: str | None = None) -> None:
+        super().__init__(what, where=where, fix=fix)
+        # What a FileNotFoundError of Python carries.
+        self.errno = errno.ENOENT
+        self.filename = None if where is None else str(where)
+
+
+class OptionError(Probe2RoadError, ValueError):
     """An option is out of range, unknown, or contradicts another."""
 
 
-class OutputError(Probe2RoadError):
+class OutputError(Probe2RoadError, OSError):
     """An output cannot be written."""
 
 

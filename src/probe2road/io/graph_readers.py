@@ -173,9 +173,10 @@ def _recorded_crs(path: Path) -> CRS | None:
     with path.open(encoding="utf-8", errors="replace") as file:
         head = file.readline(1 << 16).rstrip().removesuffix(",")
     try:
-        return parse_crs(json.loads(f"{head}}}")["probe2road"]["crs"], where=path)
+        recorded = json.loads(f"{head}}}")["probe2road"]["crs"]
     except (ValueError, LookupError, TypeError):
         return None
+    return parse_crs(recorded, where=path)
 
 
 def _with_crs(table: gpd.GeoDataFrame, crs: Any, where: object) -> gpd.GeoDataFrame:

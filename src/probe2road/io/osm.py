@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from probe2road.crs import WGS84, crs_to_text, local_crs, parse_crs, require_metric, transform
-from probe2road.errors import InputError
+from probe2road.errors import CRSError, InputError
 from probe2road.graph.direction import driving_direction
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.graph.tables import edges_with_turns
@@ -89,6 +89,8 @@ def read_osm(
         recorded = _recorded_crs(path)
         ways, refs = _read_ways(path, None if recorded is not None else highways)
         nodes = _read_nodes(path, refs)
+    except CRSError:
+        raise  # a ValueError as well, and says what is wrong
     except (RuntimeError, ValueError) as error:  # osmium's own errors are RuntimeErrors
         raise InputError(
             f"cannot be read as OSM data ({error})", where=path, fix="check that it is complete"

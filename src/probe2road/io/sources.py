@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 from pyproj import CRS
 
-from probe2road.errors import InputError
+from probe2road.errors import InputError, MissingFileError
 from probe2road.fleet.tables import TableOrigin
 
 __all__ = ["FORMATS", "POINTS_MARK", "RawTable", "SourceFile", "find_sources"]
@@ -66,16 +66,17 @@ def find_sources(
 
     Raises
     ------
+    MissingFileError
+        If a path does not exist.
     InputError
-        If a path does not exist, a file's suffix is not supported, a folder holds no supported file, or a
-        file is empty.
+        If a file's suffix is not supported, a folder holds no supported file, or a file is empty.
 
     Examples
     --------
     >>> find_sources("nowhere.csv")
     Traceback (most recent call last):
         ...
-    probe2road.errors.InputError: nowhere.csv: there is no such file or folder; check the path
+    probe2road.errors.MissingFileError: nowhere.csv: there is no such file or folder; check the path
     """
     given = [source] if isinstance(source, str | PathLike) else list(source)
     if not given:
@@ -100,7 +101,7 @@ def find_sources(
 def _existing(path: Path) -> Path:
     """Return the path of a file that can be read."""
     if not path.exists():
-        raise InputError("there is no such file or folder", where=path, fix="check the path")
+        raise MissingFileError("there is no such file or folder", where=path, fix="check the path")
     if _suffix(path) not in FORMATS:
         raise InputError(f"the suffix {_suffix(path)!r} is not supported", where=path, fix=_supported())
     if path.stat().st_size == 0:

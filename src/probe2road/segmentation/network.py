@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe2road.bounds import AtLeast, AtMost, OneOf, Positive
-from probe2road.errors import InputError, OptionError
+from probe2road.errors import InputError, MissingFileError, OptionError
 from probe2road.fleet.contract import Fleet
 from probe2road.options import checked
 from probe2road.raster.counts import CHANNELS
@@ -53,7 +53,7 @@ def shipped_weights(*, points: bool) -> Path:
     name = "gnss-vision.onnx" if points else "gnss.onnx"
     path = Path(str(resources.files("probe2road").joinpath("weights", name)))
     if not path.is_file():
-        raise InputError("this installation has no weights", where=path, fix=f"name a file, or {_NO_NETWORK}")
+        raise MissingFileError("this installation has no weights", where=path, fix=f"name a file, or {_NO_NETWORK}")
     return path
 
 

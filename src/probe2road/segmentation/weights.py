@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe2road.bounds import NotEmpty, Positive, Probability
-from probe2road.errors import InputError, OptionError
+from probe2road.errors import InputError, MissingFileError, OptionError
 from probe2road.options import checked
 
 __all__ = ["FORMAT", "ModelInfo", "Weights", "network_input", "pack_weights", "read_weights"]
@@ -117,7 +117,8 @@ def read_weights(path: str | Path) -> Weights:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"weights cannot be read ({error.strerror})", where=path) from error
+        kind = MissingFileError if isinstance(error, FileNotFoundError) else InputError
+        raise kind(f"weights cannot be read ({error.strerror})", where=path) from error
     text, digest = _metadata(data, path)
     try:
         table = json.loads(text)

@@ -18,7 +18,7 @@ from probe2road.benchmark.sets.recording import POSES, Recording
 from probe2road.benchmark.sets.reference import labelled_reference
 from probe2road.benchmark.sets.tiles import split_area
 from probe2road.bounds import NotNegative, OneOf
-from probe2road.errors import InputError, OptionError
+from probe2road.errors import InputError, MissingFileError, OptionError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet, read_fleet_files
 from probe2road.io.graph_files import read_graph
@@ -138,7 +138,7 @@ def _recording(source: Source, sets: str | Path) -> Recording:
     recording = Recording(Path(sets) / source.name)
     if not recording.reference.exists():
         fix = f"run probe2road benchmark prepare {source.name} --output {sets}"
-        raise InputError("there is no such data set", where=recording.folder, fix=fix)
+        raise MissingFileError("there is no such data set", where=recording.folder, fix=fix)
     return recording
 
 
@@ -156,5 +156,5 @@ def _files(source: Source, sets: str | Path) -> list[Path]:
 def _changed(path: Path) -> int:
     """When a file was changed, ns."""
     if not path.exists():
-        raise InputError("is missing", where=path)
+        raise MissingFileError("is missing", where=path)
     return int(np.int64(path.stat().st_mtime_ns))

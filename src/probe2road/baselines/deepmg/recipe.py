@@ -19,7 +19,7 @@ from probe2road.baselines.deepmg.pruning import PruneOptions, prune_graph
 from probe2road.baselines.deepmg.traversals import MatcherOptions, count_traversals
 from probe2road.baselines.deepmg.variants import VARIANTS, find_variant
 from probe2road.bounds import OneOf, Probability
-from probe2road.errors import InputError, OptionError
+from probe2road.errors import MissingFileError, OptionError
 from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.options import checked
@@ -152,5 +152,5 @@ def _digest(weights: str) -> str:
     path = Path(weights)
     if not weights or not path.is_file():
         fix = "train a network with experiments/train_deepmg.py and name its weights.pt"
-        raise InputError("there is no such file of weights", where=weights or "DeepMGOptions", fix=fix)
+        raise MissingFileError("there is no such file of weights", where=weights or "DeepMGOptions", fix=fix)
     return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()

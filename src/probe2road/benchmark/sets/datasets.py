@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from probe2road.benchmark.sets.reference import MAIN_ROADS, PRIMARY_ROADS, main_roads
-from probe2road.errors import InputError, OptionError
+from probe2road.errors import MissingFileError, OptionError
 from probe2road.simulation.drawn.generate import INTERCHANGES, generate_corridor, generate_interchange, generate_town
 from probe2road.simulation.networks.network import RoadNetwork
 from probe2road.simulation.networks.osm import read_network
@@ -160,7 +160,7 @@ def load_network(data: Dataset, folder: str | Path) -> RoadNetwork:
     if not data.generated:
         path = Path(folder) / data.network
         if not path.is_file():
-            raise InputError(
+            raise MissingFileError(
                 "there is no such extract", where=path, fix='name the folder of extracts, for example data="extracts"'
             )
         return main_roads(read_network(path, highways=(*MAIN_ROADS, *PRIMARY_ROADS)))

@@ -22,7 +22,7 @@ import pandas as pd
 import shapely
 
 from probe2road.crs import WGS84, local_crs, parse_crs, require_metric, transform
-from probe2road.errors import InputError
+from probe2road.errors import InputError, MissingFileError
 from probe2road.simulation.networks.altitude import solve_heights
 from probe2road.simulation.networks.network import NetworkReport, RoadNetwork, network_from_sections
 from probe2road.simulation.networks.profile import HeightOptions
@@ -118,7 +118,7 @@ def read_network(
     >>> read_network("nowhere.osm")
     Traceback (most recent call last):
         ...
-    probe2road.errors.InputError: nowhere.osm: no such file; check the path
+    probe2road.errors.MissingFileError: nowhere.osm: no such file; check the path
     """
     extract = _read_extract(Path(path), tuple(highways))
     lon, lat = np.array(
@@ -159,7 +159,7 @@ def read_network(
 def _read_extract(path: Path, highways: tuple[str, ...]) -> _Extract:
     """Read ways of the wanted classes, positions, and turn restrictions."""
     if not path.is_file():
-        raise InputError("no such file", where=path, fix="check the path")
+        raise MissingFileError("no such file", where=path, fix="check the path")
     extract, wanted = _Extract(), set(highways)
     try:
         for item in osmium.FileProcessor(str(path)):
