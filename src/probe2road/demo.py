@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from probe2road.draw.page import view
 from probe2road.draw.stages import draw_stages
+from probe2road.draw.view import view
 from probe2road.fleet.contract import Fleet
 from probe2road.io.atomic import make_folder
 from probe2road.io.fleet_reader import read_fleet_files

@@ -20,7 +20,7 @@ import pandas as pd
 import pytest
 from matplotlib.image import imread
 
-from probe2road.draw.page import view
+from probe2road.draw.page import write_page
 from probe2road.errors import OptionError, OutputError
 from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
@@ -65,7 +65,7 @@ def embedded(page: str) -> dict[str, object]:
 
 
 def test_the_page_holds_edges_nodes_and_densities_but_no_trace(graph: RoadGraph, fleet: Fleet, tmp_path: Path) -> None:
-    view(graph, tmp_path / "roads.html", fleet=fleet, title="Main Street")
+    write_page(graph, tmp_path / "roads.html", fleet=fleet, title="Main Street")
     page = (tmp_path / "roads.html").read_text()
     data = embedded(page)
     assert [feature["properties"]["edge"] for feature in data["edges"]["features"]] == [10, 11, 12]
@@ -81,7 +81,7 @@ def test_the_page_holds_edges_nodes_and_densities_but_no_trace(graph: RoadGraph,
 
 
 def test_densities_lie_where_the_traces_are(graph: RoadGraph, fleet: Fleet, tmp_path: Path) -> None:
-    view(graph, tmp_path / "roads.html", fleet=fleet)
+    write_page(graph, tmp_path / "roads.html", fleet=fleet)
     data = embedded((tmp_path / "roads.html").read_text())
     image = data["densities"][0]
     (tmp_path / "traces.png").write_bytes(base64.b64decode(image["close"].removeprefix("data:image/png;base64,")))
@@ -99,14 +99,14 @@ def test_densities_lie_where_the_traces_are(graph: RoadGraph, fleet: Fleet, tmp_
 def test_the_title_cannot_break_out_of_the_page(graph: RoadGraph, tmp_path: Path) -> None:
     evil = "</title></script><script>alert(1)</script>{{data}}"
     named = replace(graph, edges=graph.edges.assign(name=evil))
-    view(named, tmp_path / "roads.html", title=evil)
+    write_page(named, tmp_path / "roads.html", title=evil)
     page = (tmp_path / "roads.html").read_text()
     assert "<script>alert" not in page
     assert embedded(page)["edges"]["features"][0]["properties"]["name"] == evil
 
 
 def test_the_page_names_no_host_that_a_browser_would_ask(graph: RoadGraph, tmp_path: Path) -> None:
-    view(graph, tmp_path / "roads.html")
+    write_page(graph, tmp_path / "roads.html")
     page = (tmp_path / "roads.html").read_text()
     assert "default-src 'none'" in page
     assert not re.search(r'(src|href)="?https?:', page.replace('href="https://maplibre.org/"', ""))
@@ -114,7 +114,7 @@ def test_the_page_names_no_host_that_a_browser_would_ask(graph: RoadGraph, tmp_p
 
 
 def test_numbers_are_classed_by_quantiles_and_missing_values_said(graph: RoadGraph, tmp_path: Path) -> None:
-    view(graph, tmp_path / "roads.html", color_by="support")
+    write_page(graph, tmp_path / "roads.html", color_by="support")
     first, *others = embedded((tmp_path / "roads.html").read_text())["attributes"]
     assert (first["name"], first["missing"]) == ("support", True)
     assert len(first["classes"]) == len(first["breaks"]) + 1
@@ -125,11 +125,11 @@ def test_impossible_requests_are_named(graph: RoadGraph, tmp_path: Path) -> None
     with pytest.raises(
         OptionError, match="edges cannot be coloured by 'forward'; use one of length, origin, support, score"
     ):
-        view(graph, tmp_path / "roads.html", color_by="forward")
+        write_page(graph, tmp_path / "roads.html", color_by="forward")
     with pytest.raises(OptionError, match="resolution is 0"):
-        view(graph, tmp_path / "roads.html", resolution=0)
+        write_page(graph, tmp_path / "roads.html", resolution=0)
     with pytest.raises(OutputError, match="column 'vehicle_id' of the edges may identify drives"):
-        view(replace(graph, edges=graph.edges.assign(vehicle_id=1)), tmp_path / "roads.html")
+        write_page(replace(graph, edges=graph.edges.assign(vehicle_id=1)), tmp_path / "roads.html")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -220,7 +220,7 @@ def opened(page: Path, url_hash: str = "") -> Iterator[Tab]:
 
 @needs_chromium
 def test_chromium_draws_the_map_and_a_click_shows_the_edge(graph: RoadGraph, fleet: Fleet, tmp_path: Path) -> None:
-    view(graph, tmp_path / "roads.html", fleet=fleet)
+    write_page(graph, tmp_path / "roads.html", fleet=fleet)
     with opened(tmp_path / "roads.html") as tab:
         state = tab.state()
         assert (state["state"], state["densities"]) == ("ready", "3")
@@ -248,7 +248,7 @@ def test_chromium_draws_the_map_and_a_click_shows_the_edge(graph: RoadGraph, fle
 
 @needs_chromium
 def test_chromium_hides_layers_and_changes_colours(graph: RoadGraph, fleet: Fleet, tmp_path: Path) -> None:
-    view(graph, tmp_path / "roads.html", fleet=fleet)
+    write_page(graph, tmp_path / "roads.html", fleet=fleet)
     with opened(tmp_path / "roads.html") as tab:
         tab.evaluate("document.querySelector('#layers input').click()")
         assert tab.evaluate("map.getLayoutProperty('traces-far', 'visibility')") == "none"
@@ -262,7 +262,7 @@ def test_chromium_hides_layers_and_changes_colours(graph: RoadGraph, fleet: Flee
 
 @needs_chromium
 def test_chromium_opens_the_edge_that_the_address_names(graph: RoadGraph, tmp_path: Path) -> None:
-    view(graph, tmp_path / "roads.html")
+    write_page(graph, tmp_path / "roads.html")
     with opened(tmp_path / "roads.html", "#edge=10") as tab:
         assert tab.state()["state"] == "ready"
         panel = tab.panel()
@@ -274,6 +274,6 @@ def test_chromium_opens_the_edge_that_the_address_names(graph: RoadGraph, tmp_pa
 
 @needs_chromium
 def test_chromium_draws_the_graph_without_roads(fleet: Fleet, tmp_path: Path) -> None:
-    view(empty_graph("EPSG:32616"), tmp_path / "nothing.html", fleet=fleet)
+    write_page(empty_graph("EPSG:32616"), tmp_path / "nothing.html", fleet=fleet)
     with opened(tmp_path / "nothing.html") as tab:
         assert tab.state() == {"state": "ready", "rendered": "0", "densities": "3"}

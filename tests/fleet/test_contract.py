@@ -30,7 +30,7 @@ def drives(**columns: object) -> pd.DataFrame:
 
 def refusal(table: pd.DataFrame, points: pd.DataFrame | None = None, crs: str = UTM) -> str:
     with pytest.raises(InputError) as caught:
-        fleet_from_tables(table, points, crs=crs, where="drives")
+        fleet_from_tables(table, points, crs=crs)
     return str(caught.value)
 
 

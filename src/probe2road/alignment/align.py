@@ -28,12 +28,19 @@ __all__ = ["AlignOptions", "Alignment", "add_drives", "align"]
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Alignment:
     """An aligned fleet and what alignment did to it."""
 
     fleet: Fleet
     report: AlignmentReport
+
+    def __repr__(self) -> str:
+        return f"Alignment({self.fleet!r}, {self.report!r})"
+
+    def _repr_html_(self) -> str:
+        """Show figures in a notebook, and no id."""
+        return f"<b>Alignment</b><br>{self.fleet._repr_html_()}{self.report._repr_html_()}"
 
 
 @dataclass(frozen=True)

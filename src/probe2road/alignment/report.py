@@ -17,6 +17,7 @@ from probe2road.alignment.tiling import Moves
 from probe2road.errors import InputError
 from probe2road.fleet.contract import Fleet
 from probe2road.io.atomic import atomic_path
+from probe2road.notebook import figures_table
 
 __all__ = ["STATUSES", "AlignmentReport", "draw_alignment", "make_report", "write_report"]
 
@@ -30,7 +31,7 @@ _WINDOW = 250.0  # m, side of the area that is drawn where none is given
 _MOST_DRAWN = 60_000  # points in a panel
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AlignmentReport:
     """The outcome of an alignment, in figures.
 
@@ -69,6 +70,16 @@ class AlignmentReport:
             "spread_after": _rounded(self.spread_after),
             "tiles": self.tiles,
         }
+
+    def __repr__(self) -> str:
+        figures = self.summary
+        drives = ", ".join(f"{figures[name]} {name}" for name in STATUSES if figures[name])
+        apart = f"{figures['spread_before']} to {figures['spread_after']} m"
+        return f"AlignmentReport({figures['drives']} drives: {drives}; lines {apart})"
+
+    def _repr_html_(self) -> str:
+        """Show the figures in a notebook, and no id."""
+        return figures_table("AlignmentReport", self.summary)
 
 
 def make_report(fleet: Fleet, reasons: NDArray[np.str_], held: NDArray[np.bool_], moves: Moves) -> AlignmentReport:

@@ -263,19 +263,16 @@ def view(
     reference_format: Said[GraphFormat],
 ) -> None:
     """Draw a road graph over its traces: one HTML page that needs no network, or a picture."""
-    from probe2road.draw.page import view
-    from probe2road.draw.picture import draw_graph
+    from probe2road.draw.view import require_drawable
+    from probe2road.draw.view import view as draw
     from probe2road.io.fleet_reader import read_fleet
 
-    if output.suffix.lower() not in (".html", ".htm", ".png"):
-        raise OptionError(f"cannot draw {output.suffix or 'no suffix'}", where=output, fix="use .html or .png")
+    require_drawable(output)
     format = chosen_format(fleet_format)
     roads = read_roads(graph, graph_format, target_crs=format.target_crs)
     fleet = read_fleet(traces, points, format=format, target_crs=roads.crs) if traces else None
-    if output.suffix.lower() == ".png":
-        draw_graph(roads, output, fleet=fleet, reference=read_roads(reference, reference_format) if reference else None)
-    else:
-        view(roads, output, fleet=fleet, title=title or graph.name)
+    compared = read_roads(reference, reference_format) if reference else None
+    draw(roads, output, fleet=fleet, reference=compared, title=title or graph.name)
 
 
 @app.command()

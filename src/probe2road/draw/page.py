@@ -34,7 +34,7 @@ from probe2road.io.graph_writers import geojson_features
 from probe2road.raster.counts import rasterize
 from probe2road.raster.grid import Grid
 
-__all__ = ["view"]
+__all__ = ["page_text", "write_page"]
 
 logger = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ _SEQUENCE = ("#fdc328", "#f07f4f", "#cc4778", "#8305a7", "#2c0594")  # light to 
 _UNITS = {"length": "m"}
 
 
-def view(
+def write_page(
     graph: RoadGraph,
     path: str | PathLike[str],
     *,
@@ -100,13 +100,29 @@ def view(
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> page = Path(tempfile.mkdtemp()) / "roads.html"
     >>> graph = graph_from_lines([[(446000, 4636000), (446100, 4636000)]], crs="EPSG:32616")
-    >>> view(graph, page, title="A & B")
+    >>> write_page(graph, page, title="A & B")
     >>> "<h1>A &amp; B</h1>" in page.read_text()
     True
     """
+    page = page_text(graph, where=path, fleet=fleet, title=title, color_by=color_by, resolution=resolution)
+    with atomic_path(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    logger.info("wrote a view of %d edges to %s (%.1f MB)", len(graph.edges), path, len(page) / 1e6)
+
+
+def page_text(
+    graph: RoadGraph,
+    *,
+    where: object,
+    fleet: Fleet | None = None,
+    title: str = "Road graph",
+    color_by: str = "origin",
+    resolution: float = 1.0,
+) -> str:
+    """Return the page as text; see `write_page`. Errors name ``where`` as the place it was meant for."""
     if not resolution > 0:
         raise OptionError(f"resolution is {resolution}", where="view", fix="use metres per pixel, for example 1.0")
-    graph = outgoing(graph, where=path)
+    graph = outgoing(graph, where=where)
     data = {
         "bounds": _bounds(graph, fleet),
         "edges": {"type": "FeatureCollection", "features": geojson_features(_edge_table(graph), decimals=_DECIMALS)},
@@ -115,10 +131,7 @@ def view(
         "attributes": _attributes(graph.edges, color_by),
         "columns": _columns(graph.edges),
     }
-    page = _page(title=title, summary=_summary(graph, fleet), data=data)
-    with atomic_path(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
-    logger.info("wrote a view of %d edges to %s (%.1f MB)", len(graph.edges), path, len(page) / 1e6)
+    return _page(title=title, summary=_summary(graph, fleet), data=data)
 
 
 def _page(*, title: str, summary: str, data: dict[str, Any]) -> str:

@@ -14,7 +14,7 @@ from pyproj import CRS
 
 from probe2road.bounds import NotNegative, Positive
 from probe2road.crs import WGS84, is_true_to_scale, local_crs, parse_crs, require_metric, transform, turn_headings
-from probe2road.errors import CRSError, InputError
+from probe2road.errors import CRSError, InputError, OptionError
 from probe2road.fleet.tables import (
     POINT_KINDS,
     check_points,
@@ -24,6 +24,7 @@ from probe2road.fleet.tables import (
     run_starts,
     sort_fixes,
 )
+from probe2road.notebook import figures_table
 from probe2road.options import checked
 
 __all__ = [
@@ -39,11 +40,12 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fleet:
     """Traces and semantic points of a vehicle fleet, in one metric CRS.
 
-    Build it with `fleet_from_tables` or `probe2road.read_fleet`, which validate; the constructor trusts you.
+    Build it with `fleet_from_tables` or `probe2road.read_fleet`, which validate; the constructor trusts you. A fleet
+    equals itself only; compare the tables where their content counts.
 
     Attributes
     ----------
@@ -57,6 +59,12 @@ class Fleet:
         `POINT_KINDS`); optional ``accuracy``. Empty where the fleet has no camera.
     crs
         Metric CRS of both tables.
+
+    Examples
+    --------
+    >>> table = pd.DataFrame({"trace_id": ["a", "a", "b"], "x": [446000.0, 446009, 446000], "y": 4636000.0})
+    >>> fleet_from_tables(table, crs="EPSG:32616")
+    Fleet(2 traces, 3 fixes, 0 points, WGS 84 / UTM zone 16N)
     """
 
     traces: pd.DataFrame
@@ -94,6 +102,15 @@ class Fleet:
         """
         x, y = self.traces["x"].to_numpy(), self.traces["y"].to_numpy()
         return float(x.min()), float(y.min()), float(x.max()), float(y.max())
+
+    def __repr__(self) -> str:
+        return f"Fleet({self.n_traces} traces, {len(self.traces)} fixes, {len(self.points)} points, {self.crs.name})"
+
+    def _repr_html_(self) -> str:
+        """Show figures in a notebook, and no id."""
+        kinds = self.points["kind"].value_counts()
+        figures = {"traces": self.n_traces, "fixes": len(self.traces), **{str(kind): n for kind, n in kinds.items()}}
+        return figures_table("Fleet", {**figures, "CRS": self.crs.name})
 
     def to_crs(self, crs: Any) -> Fleet:
         """Return the same data in another metric CRS.
@@ -187,7 +204,7 @@ def fleet_from_tables(
     *,
     crs: Any,
     target_crs: Any = None,
-    where: object = None,
+    keep_crs: bool = False,
 ) -> Fleet:
     """Validate two tables and bring them into one local metric CRS.
 
@@ -203,8 +220,9 @@ def fleet_from_tables(
     target_crs
         Metric CRS to work in. Where it is None: ``crs`` itself if that is metric and true to scale over the
         data (UTM is, Web Mercator is not), else the choice of `probe2road.crs.local_crs`.
-    where
-        What the tables were read from, for error messages.
+    keep_crs
+        Whether to stay in ``crs``, which must then be metric, even where it is not true to scale over the data: for
+        drawn or simulated coordinates near the origin of a CRS.
 
     Returns
     -------
@@ -219,6 +237,8 @@ def fleet_from_tables(
         contradict the CRS, fixes of one trace at one instant that disagree, unknown kinds of points.
     CRSError
         If there is no CRS or the target is not metric.
+    OptionError
+        If a target is given and the CRS shall be kept.
 
     Examples
     --------
@@ -227,19 +247,28 @@ def fleet_from_tables(
     >>> fleet.crs.to_epsg(), len(fleet.traces)
     (32616, 2)
 
-    >>> fleet_from_tables(table.assign(y=-87.65, x=410.87), crs="EPSG:4326", where="drives.csv")
+    >>> fleet_from_tables(table.assign(y=-87.65, x=410.87), crs="EPSG:4326")
     Traceback (most recent call last):
         ...
-    probe2road.errors.InputError: drives.csv: traces: longitudes are outside -180..180 in 2 of 2 rows ...
+    probe2road.errors.InputError: traces: longitudes are outside -180..180 in 2 of 2 rows ...
+
+    A street of 100 m, drawn at the origin:
+
+    >>> street = pd.DataFrame({"trace_id": 1, "t": range(11), "x": np.arange(0.0, 101, 10), "y": 0.0})
+    >>> fleet_from_tables(street, crs="EPSG:32616", keep_crs=True).bounds
+    (0.0, 0.0, 100.0, 0.0)
     """
-    source = require_metric(None, where=where) if crs is None else parse_crs(crs, where=where)
+    if keep_crs and target_crs is not None:
+        raise OptionError("keep_crs contradicts target_crs", where="fleet_from_tables", fix="give one of them")
+    source = require_metric(None) if crs is None else parse_crs(crs)
     faults: list[str] = []
     traces = check_traces(traces, source, faults)
     if points is not None:
         points = check_points(points, source, faults)
     if faults:
-        raise InputError.from_faults(faults, where=where)
-    return fleet_from_checked(traces, points, crs=source, points_crs=source, target_crs=target_crs, where=where)
+        raise InputError.from_faults(faults)
+    target = source if keep_crs else target_crs
+    return fleet_from_checked(traces, points, crs=source, points_crs=source, target_crs=target)
 
 
 def fleet_from_checked(

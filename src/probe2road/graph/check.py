@@ -12,12 +12,12 @@ from probe2road.graph.ends import end_rows
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import EDGE_DTYPES, ORIGINS
 
-__all__ = ["check_graph"]
+__all__ = ["check_graph", "require_sound"]
 
 _END_TOLERANCE = 1e-3  # m; an edge ends at its node to within this
 
 
-def check_graph(graph: RoadGraph, *, where: object = "graph") -> None:
+def check_graph(graph: RoadGraph) -> None:
     """Verify the invariants of a road graph.
 
     Raises
@@ -40,6 +40,11 @@ def check_graph(graph: RoadGraph, *, where: object = "graph") -> None:
         ...
     probe2road.errors.InputError: graph: edge 0 ends at a node that does not exist (v = 1)
     """
+    require_sound(graph, where="graph")
+
+
+def require_sound(graph: RoadGraph, *, where: object) -> None:
+    """Refuse a graph that `check_graph` refuses; the error says where it is from. For readers and writers."""
     nodes, edges = graph.nodes, graph.edges
     missing = [column for column in (*EDGE_DTYPES, "geometry") if column not in edges]
     if missing:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import geopandas as gpd
 import networkx as nx
@@ -28,16 +28,20 @@ from probe2road.crs import parse_crs, require_metric
 from probe2road.graph.ends import EdgeEnds, end_rows
 from probe2road.graph.networkx import to_networkx
 from probe2road.graph.tables import degrees, empty_turns, finish_edges, move_ends
+from probe2road.notebook import figures_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["RoadGraph", "empty_graph", "graph_from_lines"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RoadGraph:
     """A road network as an undirected multigraph with geometry, in one metric CRS.
 
     Build it with `graph_from_lines`, `empty_graph` or a reader; the constructor trusts you, `check_graph`
-    does not.
+    does not. A graph equals itself only; compare the tables where their content counts.
 
     Attributes
     ----------
@@ -136,6 +140,52 @@ class RoadGraph:
         """Return an OSMnx ``MultiDiGraph``; see `probe2road.graph.networkx.to_networkx`."""
         return to_networkx(self.nodes, self.edges, self.turns, min_count=min_count)
 
+    def plot(self, column: str | None = None, *, ax: Axes | None = None, **style: Any) -> Axes:
+        """Draw the edges with matplotlib, as ``GeoDataFrame.plot`` does.
+
+        Parameters
+        ----------
+        column
+            Edge column to colour by; one colour where it is None.
+        ax
+            Axes to draw into; a new figure where it is None.
+        **style
+            Further arguments of ``GeoDataFrame.plot``: ``color``, ``linewidth``, ``legend``, ``figsize`` and others.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+
+        Examples
+        --------
+        >>> from matplotlib.figure import Figure
+        >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 50)]], crs="EPSG:32616")
+        >>> axes = graph.plot("length", ax=Figure().subplots(), linewidth=2)
+        >>> len(axes.collections)
+        1
+        """
+        return self.edges.plot(column, ax=ax, **style)
+
+    def explore(self, **options: Any) -> Any:
+        """Show the graph as a page to move about in: in the notebook, or else in the web browser.
+
+        Unlike the page of ``GeoDataFrame.explore``, this one needs no network.
+
+        Parameters
+        ----------
+        **options
+            Arguments of `probe2road.draw.view.explore`: ``fleet`` to draw underneath, ``title``, ``color_by``.
+
+        Returns
+        -------
+        probe2road.draw.view.Page
+            A notebook shows it; ``save`` writes it to a file.
+        """
+        # Drawing stands far below graphs in the layers: take it through the front door, as the user would.
+        import probe2road
+
+        return probe2road.draw.view.explore(self, **options)
+
     def __getstate__(self) -> dict[str, Any]:
         """Return the tables alone for pickling and copying: what was measured of them is quickly measured again."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
@@ -144,6 +194,12 @@ class RoadGraph:
         return (
             f"RoadGraph({len(self.nodes)} nodes, {len(self.edges)} edges, {self.length / 1000:.3f} km, {self.crs.name})"
         )
+
+    def _repr_html_(self) -> str:
+        """Show figures in a notebook."""
+        origins = {f"... of origin {origin}": n for origin, n in self.edges["origin"].value_counts().items()}
+        figures = {"nodes": len(self.nodes), "edges": len(self.edges), **origins}
+        return figures_table("RoadGraph", {**figures, "km": f"{self.length / 1000:.3f}", "CRS": self.crs.name})
 
 
 def empty_graph(crs: Any) -> RoadGraph:

@@ -1,4 +1,7 @@
-"""Files in and out: readers with a column map, writers that are atomic.
+"""Files in and out: readers with a column map, writers that are atomic."""
 
-Nothing is imported here, so that reading a CSV does not load what writing OSM needs.
-"""
+from pkgutil import iter_modules
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, [module.name for module in iter_modules(__path__)])

@@ -10,8 +10,8 @@ from typing import Any
 
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError
 
-from probe2road.errors import InputError, OptionError, OutputError
-from probe2road.graph.check import check_graph
+from probe2road.errors import InputError, MissingFileError, OptionError, OutputError
+from probe2road.graph.check import require_sound
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.formats import GraphFormat, adjusted
 from probe2road.io.graph_networkx import read_graphml, write_graphml
@@ -56,9 +56,11 @@ def write_graph(graph: RoadGraph, path: str | PathLike[str]) -> None:
     RoadGraph(2 nodes, 1 edges, 0.100 km, WGS 84 / UTM zone 16N)
     """
     writer = _WRITERS[graph_format(path, WRITABLE)]
-    check_graph(graph, where="graph to write")
+    require_sound(graph, where="graph to write")
     try:
         writer(graph, path)
+    except OutputError:
+        raise  # an OSError as well, and says what is wrong
     except (OSError, RuntimeError, DataSourceError, DataLayerError, FieldError, FeatureError) as error:
         raise OutputError(f"cannot be written ({error})", where=path) from error
     logger.info("wrote %d nodes and %d edges to %s", len(graph.nodes), len(graph.edges), path)
@@ -93,8 +95,10 @@ def read_graph(
 
     Raises
     ------
+    MissingFileError
+        If the file is absent.
     InputError
-        If the file is absent, empty or damaged, or holds no lines.
+        If it is empty or damaged, or holds no lines.
     CRSError
         If it names no CRS and none is given, or the two contradict.
     OptionError
@@ -103,7 +107,7 @@ def read_graph(
     format = adjusted(format or GraphFormat(), crs=crs, target_crs=target_crs, layer=layer)
     kind = graph_format(path, READABLE)
     if not Path(path).is_file():
-        raise InputError("no such file", where=path, fix="check the path")
+        raise MissingFileError("no such file", where=path, fix="check the path")
     if Path(path).stat().st_size == 0:
         raise InputError("the file is empty", where=path, fix="check that it is complete")
     if kind == "OSM":

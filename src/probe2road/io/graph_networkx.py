@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from probe2road.crs import local_crs, parse_crs, require_metric
 from probe2road.errors import CRSError, InputError
-from probe2road.graph.check import check_graph
+from probe2road.graph.check import require_sound
 from probe2road.graph.ends import end_rows
 from probe2road.graph.networkx import present
 from probe2road.graph.roadgraph import RoadGraph
@@ -148,7 +148,7 @@ def _from_foreign(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame) -> RoadGraph
     for column in further.columns.drop(["u", "v", "geometry"]):
         further[column] = further[column].map(_single_value)
     graph = RoadGraph(nodes, finish_edges(further.assign(origin="reference")), empty_turns())
-    check_graph(graph, where="NetworkX graph")
+    require_sound(graph, where="NetworkX graph")
     return graph
 
 

@@ -18,7 +18,7 @@ import shapely
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OutputError
-from probe2road.graph.check import check_graph
+from probe2road.graph.check import require_sound
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import (
     EDGE_DTYPES,
@@ -157,7 +157,7 @@ def graph_from_edge_table(
     else:
         nodes = nodes.astype({"node": "int64"}).set_index("node").sort_index()
     graph = RoadGraph(nodes, edges, turns)
-    check_graph(graph, where=where)
+    require_sound(graph, where=where)
     return graph
 
 

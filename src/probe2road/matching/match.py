@@ -28,6 +28,7 @@ from probe2road.matching.observe import observe, sampling_interval, seconds
 from probe2road.matching.published import match_published
 from probe2road.matching.tables import fix_table, joined_paths, step_rows, step_table
 from probe2road.matching.viterbi import parameters
+from probe2road.notebook import figures_table
 from probe2road.options import checked
 
 __all__ = ["PROFILES", "MatchOptions", "Matches", "match", "turn_counts"]
@@ -50,7 +51,7 @@ class MatchOptions:
     published: PublishedModel = field(default=PublishedModel())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Matches:
     """What `match` found.
 
@@ -70,6 +71,23 @@ class Matches:
 
     fixes: pd.DataFrame
     steps: pd.DataFrame
+
+    def __repr__(self) -> str:
+        return f"Matches({', '.join(f'{count} {name}' for name, count in self._figures().items())})"
+
+    def _repr_html_(self) -> str:
+        """Show figures in a notebook, and no id."""
+        return figures_table("Matches", self._figures())
+
+    def _figures(self) -> dict[str, int]:
+        matched = self.fixes["edge"].notna()
+        return {
+            "traces": self.fixes["trace_id"].nunique(),
+            "fixes": len(self.fixes),
+            "fixes matched": int(matched.sum()),
+            "steps": len(self.steps),
+            "edges driven": self.steps["edge"].nunique(),
+        }
 
 
 def match(

@@ -67,7 +67,7 @@ def evaluate(
     proposal: RoadGraph,
     reference: RoadGraph,
     *,
-    metrics: Sequence[str | MetricOptions] = DEFAULT_METRICS,
+    metrics: str | MetricOptions | Sequence[str | MetricOptions] = DEFAULT_METRICS,
     area: Any = None,
     merge: bool = True,
 ) -> pd.DataFrame:
@@ -79,7 +79,7 @@ def evaluate(
         Road graphs in metric CRS; the proposal is reprojected to the CRS of the reference. Either may be empty and
         then scores 0.
     metrics
-        Names out of `METRICS`, or options of a metric where its defaults do not suit: ``["geo",
+        A name out of `METRICS`, or options of a metric where its defaults do not suit, or several of them: ``["geo",
         GeoOptions(radius=15)]`` scores twice.
     area
         Clip both graphs to this polygon or ``(left, bottom, right, top)`` first, in the CRS of the reference.
@@ -107,7 +107,8 @@ def evaluate(
     0    geo  1.0       15.0
     1    geo  1.0       15.0
     """
-    options = [_resolve(metric) for metric in metrics]
+    wanted = metrics if isinstance(metrics, Sequence) and not isinstance(metrics, str) else [metrics]
+    options = [_resolve(metric) for metric in wanted]
     first, second = comparable_networks(proposal, reference, area=area, merge=merge)
     scores: list[Score] = []
     for option in options:

@@ -46,7 +46,7 @@ logger = logging.getLogger(__name__)
 _WORLD, _DRIVE, _VEHICLE = 0, 1, 2  # first key of the random streams
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FleetChunk:
     """Some consecutive drives: raw fleet data, and the truth behind it."""
 
@@ -57,7 +57,7 @@ class FleetChunk:
     length: NDArray[np.float64]  # (drives,) m driven
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SimulatedFleet:
     """Fleet data as vehicles would record it, and the truth behind it.
 
@@ -80,6 +80,13 @@ class SimulatedFleet:
     poses: pd.DataFrame
     routes: pd.DataFrame
     reference: RoadGraph
+
+    def __repr__(self) -> str:
+        return f"SimulatedFleet({self.fleet!r} on {self.reference!r})"
+
+    def _repr_html_(self) -> str:
+        """Show figures in a notebook, and no id."""
+        return f"<b>SimulatedFleet</b><br>{self.fleet._repr_html_()}{self.reference._repr_html_()}"
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,7 @@
 """Biagioni and Eriksson, "Map inference in the face of noise and disparity", SIGSPATIAL 2012, start to end."""
+
+from pkgutil import iter_modules
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, [module.name for module in iter_modules(__path__)])

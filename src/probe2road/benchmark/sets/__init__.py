@@ -1,1 +1,7 @@
 """Simulated fleets on disk: data sets with known truth, made from fixed seeds, and their splits."""
+
+from pkgutil import iter_modules
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, [module.name for module in iter_modules(__path__)])

@@ -1,1 +1,7 @@
 """The paper's tables on open data: methods times data sets, scored, with intervals, pictures and what they cost."""
+
+from pkgutil import iter_modules
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, [module.name for module in iter_modules(__path__)])

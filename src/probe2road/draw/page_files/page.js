@@ -145,6 +145,7 @@ try {
   map.on("click", (event) => {
     const feature = edgeAt(event.point);
     selectEdge(feature ? feature.properties.edge : null);
+    if (location.protocol === "about:") return; // in the frame of a notebook there is no address to keep it in
     history.replaceState(null, "", feature ? `#edge=${feature.properties.edge}` : "#");
   });
   map.on("mousemove", (event) => { map.getCanvas().style.cursor = edgeAt(event.point) ? "pointer" : ""; });
