@@ -30,6 +30,7 @@ from probe2road.draw.view import Page
 UTM = "EPSG:32616"
 VERBS = ("read_fleet", "simulate", "align", "build", "refine", "match", "label", "evaluate", "view", "write_graph")
 VERBS += ("read_graph", "write_fleet", "describe_fleet", "describe_graph", "rasterize", "clean_graph", "add_drives")
+VERBS += ("read_network", "find_preset", "fleet_from_tables", "graph_from_lines", "check_graph", "from_networkx")
 ROOMS = [module.name for module in iter_modules(p2r.__path__) if module.name != "__main__"]
 
 
@@ -70,7 +71,7 @@ def ours(hint: Any) -> set[type]:
     found = {part for item in typing.get_args(hint) for part in ours(item)}
     if isinstance(hint, type) and hint.__module__.startswith("probe2road."):
         found.add(hint)
-        if is_dataclass(hint) and re.search("Options$|Preset$", hint.__name__):
+        if is_dataclass(hint) and re.search("Options$|Preset$|TraceGaps", hint.__name__):
             hints = typing.get_type_hints(hint)
             found |= {part for entry in fields(hint) for part in ours(hints[entry.name])}
     return found

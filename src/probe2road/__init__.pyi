@@ -14,6 +14,7 @@ from . import graph as graph
 from . import io as io
 from . import matching as matching
 from . import metrics as metrics
+from . import notebook as notebook
 from . import options as options
 from . import raster as raster
 from . import recipe as recipe
@@ -94,6 +95,7 @@ from .simulation.fleet_simulation import SimulatedFleet as SimulatedFleet
 from .simulation.fleet_simulation import simulate as simulate
 from .simulation.networks.network import RoadNetwork as RoadNetwork
 from .simulation.networks.osm import read_network as read_network
+from .simulation.networks.profile import ProfileOptions as ProfileOptions
 from .simulation.presets import Preset as Preset
 from .simulation.presets import RecordingModel as RecordingModel
 from .simulation.presets import SurroundingsModel as SurroundingsModel

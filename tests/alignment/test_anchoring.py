@@ -10,7 +10,7 @@ import pytest
 from probe2road.alignment.align import AlignOptions
 from probe2road.alignment.anchoring import anchored
 from probe2road.alignment.keyframes import Keyframes, keyframes
-from probe2road.alignment.profiles import Places
+from probe2road.alignment.profiles import RoadPlaces
 
 N = 16  # drives
 
@@ -25,7 +25,7 @@ def moved_back(frames: Keyframes, off: float, *, drives: int = N, held: int = 0)
     pose = frames.pose + np.array([0.0, off, 0.0])
     floor = (frames.pose[:, 0] // 10.0).astype(np.int64)
     home = np.where(frames.drive < drives, floor - floor.min(), -1)
-    places = Places.from_roads(np.zeros(home.max() + 1, np.int64))
+    places = RoadPlaces.from_roads(np.zeros(home.max() + 1, np.int64))
     there = anchored(frames, pose, np.zeros(len(pose)), home, places, AlignOptions(), held=frames.drive < held)
     assert (there[:, [0, 2]] == pose[:, [0, 2]]).all()
     return pose[:, 1] - there[:, 1]

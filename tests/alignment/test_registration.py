@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from probe2road.alignment.hypotheses import Track
-from probe2road.alignment.profiles import Places, ShiftSearch
-from probe2road.alignment.registration import Chains, Evidence, register
+from probe2road.alignment.profiles import RoadPlaces, ShiftSearch
+from probe2road.alignment.registration import Chains, DriveEvidence, register
 
-PLACES = Places.from_roads(np.zeros(10, np.int64))
+PLACES = RoadPlaces.from_roads(np.zeros(10, np.int64))
 SEARCH = ShiftSearch(6.0, 0.25, 20.0, 0.3, 0.7, 0.5)
 LINES = np.array([-5.6, -1.8, 1.8])  # m; not alike under any shift of a lane
 
@@ -19,7 +19,7 @@ def shifts(off: list[float], *, settled: bool = False, held: list[bool] | None =
     n = len(off)
     keyframe = np.repeat(np.arange(10 * n), len(LINES))
     value = np.tile(LINES, 10 * n) + np.repeat(off, 10 * len(LINES))
-    seen = Evidence(keyframe, keyframe % 10, value, np.zeros(len(keyframe), np.int8))
+    seen = DriveEvidence(keyframe, keyframe % 10, value, np.zeros(len(keyframe), np.int8))
     chains = Chains(10 * np.arange(n + 1), np.arange(n), np.array(held or [False] * n))
     track = Track(
         np.arange(10 * n) % 10, np.repeat(off, 10), np.zeros(10 * n), np.full(10 * n, 0.1), np.full(10 * n, 20.0)

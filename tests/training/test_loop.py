@@ -13,17 +13,17 @@ from probe2road.training.curves import draw_curves
 from probe2road.training.finish import export_best
 from probe2road.training.loop import predict_squares, train, use_threads
 from probe2road.training.samples import SampleOptions
-from probe2road.training.sources import Source, members
+from probe2road.training.sources import TrainingSource, members
 from probe2road.training.validation import validate, validation_squares
 
 torch = pytest.importorskip("torch", reason="the extra 'train' is not installed")
 
 DATASET = "interchange-diamond-1"
 TINY = TrainConfig(
-    sources=(Source(DATASET),),
+    sources=(TrainingSource(DATASET),),
     sample=SampleOptions(size=64),
     loss=LossOptions(kind="bce_dice"),
-    validation=ValidationOptions(sources=(Source(DATASET),), squares=2, size=256, every=2),
+    validation=ValidationOptions(sources=(TrainingSource(DATASET),), squares=2, size=256, every=2),
     architecture="compact",
     steps=4,
     batch=2,
@@ -78,7 +78,7 @@ def test_shipped_configurations_run(name, sets, tmp_path):
         architecture="compact",
         steps=1,
         batch=2,
-        sources=(Source(DATASET),),
+        sources=(TrainingSource(DATASET),),
         sample=replace(shipped.sample, size=96, tiles=False),
         validation=TINY.validation,
     )
@@ -154,7 +154,7 @@ def test_configurations_that_cannot_run_are_refused():
     with pytest.raises(OptionError, match="steps is 0"):
         TrainConfig(steps=0)
     with pytest.raises(OptionError, match="no sources"):
-        TrainConfig(sources=(Source(DATASET, weight=0.0),))
+        TrainConfig(sources=(TrainingSource(DATASET, weight=0.0),))
     with pytest.raises(OptionError, match="threads is 0"):
         use_threads(0)
     with pytest.raises(OptionError, match=r"sources\[0\]: there is no option 'nam'"):

@@ -15,7 +15,7 @@ from probe2road.raster.grid import Grid
 from probe2road.raster.lines import label_mask
 from probe2road.training.samples import SampleOptions, draw_sample, square
 from probe2road.training.scene import load_scene, make_scene, rows_around, save_scene
-from probe2road.training.sources import Source, open_scene
+from probe2road.training.sources import TrainingSource, open_scene
 
 DATASET = "interchange-diamond-1"
 PLAIN = SampleOptions(
@@ -25,7 +25,7 @@ PLAIN = SampleOptions(
 
 @pytest.fixture(scope="module")
 def scene(sets):
-    return open_scene(Source(DATASET), sets)
+    return open_scene(TrainingSource(DATASET), sets)
 
 
 def place(scene):
@@ -124,8 +124,8 @@ def test_a_scene_is_kept_and_made_anew_when_its_origin_changes(scene, tmp_path):
 
 def test_your_own_fleet_and_reference(sets, tmp_path):
     recording = Recording(sets / DATASET)
-    own = Source("mine", fleet=str(recording.modelled), reference=str(recording.reference))
-    scene, truth = open_scene(own, tmp_path), open_scene(Source(DATASET), sets)
+    own = TrainingSource("mine", fleet=str(recording.modelled), reference=str(recording.reference))
+    scene, truth = open_scene(own, tmp_path), open_scene(TrainingSource(DATASET), sets)
     drawn = square(scene, place(truth), replace(PLAIN, label_width=5))
     known = square(truth, place(truth), replace(PLAIN, label_width=1))
     assert drawn.label[known.label > 0].mean() > 0.9
@@ -134,9 +134,9 @@ def test_your_own_fleet_and_reference(sets, tmp_path):
 
 def test_clear_errors(sets, tmp_path):
     with pytest.raises(InputError, match="run probe2road benchmark prepare milan"):
-        open_scene(Source("milan"), sets)
+        open_scene(TrainingSource("milan"), sets)
     with pytest.raises(OptionError, match="give the name of a data set"):
-        Source("mine", fleet="drives.csv")
+        TrainingSource("mine", fleet="drives.csv")
     with pytest.raises(OptionError, match="rotation is 'some'"):
         SampleOptions(rotation="some")
     fleet = fleet_from_tables(

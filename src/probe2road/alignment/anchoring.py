@@ -16,7 +16,7 @@ from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 from probe2road.alignment.floors import middles
 from probe2road.alignment.keyframes import Keyframes, moved_aside, recorded_aside
 from probe2road.alignment.options import AlignOptions
-from probe2road.alignment.profiles import Places
+from probe2road.alignment.profiles import RoadPlaces
 
 __all__ = ["anchored"]
 
@@ -30,7 +30,7 @@ def anchored(
     pose: NDArray[np.float64],
     angle: NDArray[np.float64],
     home: NDArray[np.int64],
-    places: Places,
+    places: RoadPlaces,
     options: AlignOptions,
     *,
     held: NDArray[np.bool_],

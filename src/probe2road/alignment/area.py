@@ -17,11 +17,11 @@ from probe2road.alignment.graph import optimise
 from probe2road.alignment.heights import solve_heights
 from probe2road.alignment.hypotheses import Track
 from probe2road.alignment.keyframes import Keyframes, Sightings, keyframes, moved_aside, recorded_aside, sightings
-from probe2road.alignment.lines import Condensed, Matches, condense, match_lines
+from probe2road.alignment.lines import Condensed, LineMatches, condense, match_lines
 from probe2road.alignment.options import AlignOptions
 from probe2road.alignment.profiles import ShiftSearch
 from probe2road.alignment.reckoning import wrapped
-from probe2road.alignment.registration import Chains, Evidence, register
+from probe2road.alignment.registration import Chains, DriveEvidence, register
 from probe2road.alignment.routes import route_heights
 from probe2road.alignment.spines import CELL, OnSpines, Spines, find_spines, project
 from probe2road.fleet.contract import Fleet
@@ -122,7 +122,7 @@ def _iterate(
     gates: tuple[float, ...],
     *,
     robust_gnss: bool,
-) -> tuple[NDArray[np.float64], Matches, list[float]]:
+) -> tuple[NDArray[np.float64], LineMatches, list[float]]:
     """Match and optimise in turn until the residuals stay as they are: poses, last matches, residual by round."""
     rounds: list[float] = []
     for gate in gates:
@@ -193,7 +193,7 @@ def _register(
         home = floor_of(floors, on.cell, spines.above(on.station, level), options)
     points, floor = _points_on_floors(scene, pose, on, spines, floors, level)
     found = floor >= 0
-    seen = Evidence(scene.seen.keyframe[found], floor[found], points.left[found], scene.seen.kind[found])
+    seen = DriveEvidence(scene.seen.keyframe[found], floor[found], points.left[found], scene.seen.kind[found])
     angle = spines.station[np.maximum(on.station, 0), 2]
     recorded = recorded_aside(frames, pose, angle)
     track = Track(
@@ -216,7 +216,7 @@ def _round(
     gate: float,
     *,
     robust_gnss: bool,
-) -> tuple[NDArray[np.float64], Matches]:
+) -> tuple[NDArray[np.float64], LineMatches]:
     """Match points to lines and optimise: new poses, and the matches that led to them."""
     options, frame = scene.options, scene.seen.keyframe
     on = project(spines, pose, options)
@@ -287,7 +287,7 @@ def _result(
     pose: NDArray[np.float64],
     z: NDArray[np.float64],
     spines: Spines,
-    matches: Matches,
+    matches: LineMatches,
     rounds: list[float],
 ) -> AlignedArea:
     """Put the result together; what residuals were before is measured against the same lines."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from probe2road.alignment.heights import VERTICAL
 from probe2road.alignment.keyframes import Keyframes
 from probe2road.alignment.options import AlignOptions
-from probe2road.alignment.profiles import Places
+from probe2road.alignment.profiles import RoadPlaces
 from probe2road.alignment.spines import OnSpines, Spines
 
 __all__ = ["Floors", "find_floors", "floor_of", "middles"]
@@ -37,7 +37,7 @@ class Floors:
 
     cell: NDArray[np.int64]  # (f,)
     height: NDArray[np.float64]  # (f,) m above the spine
-    places: Places  # the floors behind and ahead that a vehicle drives to
+    places: RoadPlaces  # the floors behind and ahead that a vehicle drives to
 
     @property
     def patch(self) -> NDArray[np.int64]:
@@ -80,14 +80,14 @@ def find_floors(
     floor = _joined(starts, middle, weight, options.altitude_gate)
     middle = np.bincount(floor, weight * middle) / np.bincount(floor, weight)
     cells = cells[np.flatnonzero(np.diff(floor, prepend=-1))]
-    floors = Floors(cells, middle, Places(np.full(len(cells), -1), np.full(len(cells), -1)))
+    floors = Floors(cells, middle, RoadPlaces(np.full(len(cells), -1), np.full(len(cells), -1)))
     linked = {}
     for name, step in (("before", -1), ("after", 1)):
         neighbour = np.clip(cells + step, 0, spines.n_cells - 1)
         same = spines.cell_spine[neighbour] == spines.cell_spine[cells] if len(cells) else np.zeros(0, bool)
         found = floor_of(floors, neighbour, middle, options)
         linked[name] = np.where(same & (neighbour != cells), found, -1)
-    return Floors(cells, middle, Places(**linked))
+    return Floors(cells, middle, RoadPlaces(**linked))
 
 
 def _heights_of_passes(

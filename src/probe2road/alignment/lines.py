@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from probe2road.alignment.options import AlignOptions
 
-__all__ = ["Condensed", "Matches", "condense", "match_lines"]
+__all__ = ["Condensed", "LineMatches", "condense", "match_lines"]
 
 _BIN = 0.1  # m, of the profile in which peaks are found
 _HALF_WIDTH = 25.0  # m, to either side of a spine
@@ -31,7 +31,7 @@ _LOOSE = np.diag([1e-4, 1e-4, 1e-2])  # information that keeps a factor regular:
 
 
 @dataclass(frozen=True)
-class Matches:
+class LineMatches:
     """Points on lines: m matched points."""
 
     point: NDArray[np.int64]  # (m,) index of the point
@@ -59,7 +59,7 @@ def match_lines(
     options: AlignOptions,
     *,
     gate: float,
-) -> Matches:
+) -> LineMatches:
     """Find the lines that enough drives saw, and match points to them.
 
     Parameters
@@ -77,7 +77,7 @@ def match_lines(
 
     Returns
     -------
-    Matches
+    LineMatches
 
     Examples
     --------
@@ -94,17 +94,17 @@ def match_lines(
     line = _nearest_peak(peak_group, peak_left, group, left[usable], gate)
     point, line = usable[line >= 0], line[line >= 0]
     if len(point) == 0:
-        return Matches(point, line, np.zeros(0), np.zeros(0))
+        return LineMatches(point, line, np.zeros(0), np.zeros(0))
     residual, slope = _residuals(line, along[point], left[point])
     pairs = np.unique(line * (int(drive.max()) + 1) + drive[point]) // (int(drive.max()) + 1)
     drives = np.bincount(pairs, minlength=len(peak_left))
     kept = (drives[line] >= options.min_drives) & (np.bincount(line)[line] >= _LEAST_POINTS)
     kept &= np.abs(residual) < gate
-    return Matches(point[kept], line[kept], residual[kept], slope[line[kept]])
+    return LineMatches(point[kept], line[kept], residual[kept], slope[line[kept]])
 
 
 def condense(
-    matches: Matches,
+    matches: LineMatches,
     keyframe: NDArray[np.int64],
     patch: NDArray[np.int64],
     body: NDArray[np.float64],

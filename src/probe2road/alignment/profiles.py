@@ -18,21 +18,30 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-__all__ = ["Places", "Profiles", "ShiftSearch", "Sights", "add_sights", "add_view", "average_view", "empty_profiles"]
+__all__ = [
+    "Profiles",
+    "RoadPlaces",
+    "ShiftSearch",
+    "Sights",
+    "add_sights",
+    "add_view",
+    "average_view",
+    "empty_profiles",
+]
 
 _VIEW_SMOOTHING = 1.5  # m, 1 sigma: of the fleet's view to the side, so that single lines do not show in it
 _SPREAD_ALONG = 2  # places to which a vote spreads, either way
 _SPREAD_DECAY = 0.75  # of a vote, from place to place
 
 
-class Places(NamedTuple):
+class RoadPlaces(NamedTuple):
     """N places along roads: where the profiles of the map are."""
 
     before: NDArray[np.int64]  # (n,) the place behind, -1 at the end of a road
     after: NDArray[np.int64]  # (n,) the place ahead
 
     @classmethod
-    def from_roads(cls, road: NDArray[np.int64]) -> Places:
+    def from_roads(cls, road: NDArray[np.int64]) -> RoadPlaces:
         """Line up places that are sorted by road and along it."""
         index = np.arange(len(road))
         same = np.concatenate([[False], road[1:] == road[:-1], [False]])
@@ -62,7 +71,7 @@ class Sights(NamedTuple):
 class Profiles(NamedTuple):
     """The map of n places; the code that places drives changes it as it goes."""
 
-    before: NDArray[np.int64]  # (n,) as in `Places`
+    before: NDArray[np.int64]  # (n,) as in `RoadPlaces`
     after: NDArray[np.int64]  # (n,)
     average: NDArray[np.float64]  # (kinds, bins) what a keyframe sees on average, by distance to its side; odd number
     votes: NDArray[np.float32]  # (n, kinds, bins) what was seen
@@ -71,7 +80,7 @@ class Profiles(NamedTuple):
     passed: NDArray[np.float64]  # (n,) how many they are
 
 
-def empty_profiles(places: Places, view: NDArray[np.float64], search: ShiftSearch) -> Profiles:
+def empty_profiles(places: RoadPlaces, view: NDArray[np.float64], search: ShiftSearch) -> Profiles:
     """Return a map on which nothing is yet."""
     n_bins = int(2 * search.half_width / search.bin) + 1
     n, shape = len(places.before), (len(places.before), len(view), n_bins)

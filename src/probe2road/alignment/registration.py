@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from probe2road.alignment.hypotheses import Track, best_path, gnss_scores, own_rates, sight_scores
 from probe2road.alignment.profiles import (
-    Places,
     Profiles,
+    RoadPlaces,
     ShiftSearch,
     Sights,
     add_sights,
@@ -34,13 +34,13 @@ from probe2road.alignment.profiles import (
     empty_profiles,
 )
 
-__all__ = ["Chains", "Evidence", "register"]
+__all__ = ["Chains", "DriveEvidence", "register"]
 
 _PASSES = 2  # how often each chain is placed, where none is yet
 
 
 @dataclass(frozen=True)
-class Evidence:
+class DriveEvidence:
     """What keyframes saw, in coordinates of places: o observations, in the order of the keyframes."""
 
     keyframe: NDArray[np.int64]  # (o,)
@@ -65,7 +65,13 @@ class Chains:
 
 
 def register(
-    evidence: Evidence, places: Places, chains: Chains, track: Track, search: ShiftSearch, *, settled: bool = False
+    evidence: DriveEvidence,
+    places: RoadPlaces,
+    chains: Chains,
+    track: Track,
+    search: ShiftSearch,
+    *,
+    settled: bool = False,
 ) -> NDArray[np.float64]:
     """Find the shift of every keyframe.
 
@@ -95,13 +101,14 @@ def register(
 
     >>> lines = np.tile([-1.5, 2.0], 40)
     >>> keyframe = np.repeat(np.arange(20), 4)
-    >>> seen = Evidence(keyframe, keyframe % 10, np.concatenate([lines[:40], lines[40:] - 3.0]), np.zeros(80, np.int8))
+    >>> value = np.concatenate([lines[:40], lines[40:] - 3.0])
+    >>> seen = DriveEvidence(keyframe, keyframe % 10, value, np.zeros(80, np.int8))
     >>> chains = Chains(np.array([0, 10, 20]), np.array([0, 1]), np.zeros(2, bool))
     >>> track = Track(
     ...     np.arange(20) % 10, np.repeat([0.25, -2.75], 10), np.zeros(20), np.full(20, 0.1), np.full(20, 10.0)
     ... )
     >>> search = ShiftSearch(8.0, 0.25, 20.0, 0.3, 2.0, 1.0)
-    >>> shift = register(seen, Places.from_roads(np.zeros(10, np.int64)), chains, track, search)
+    >>> shift = register(seen, RoadPlaces.from_roads(np.zeros(10, np.int64)), chains, track, search)
     >>> shift[10:].round(2).tolist() == [3.0] * 10
     True
     """

@@ -105,7 +105,7 @@ def count_voxels(fleet: Fleet, grid: Grid, *, height: float, gaps: TraceGaps | N
     >>> import pandas as pd
     >>> from probe2road.fleet.contract import fleet_from_tables
     >>> table = pd.DataFrame({"trace_id": 1, "t": [0, 1], "x": [900.5, 903.5], "y": 0.5, "z": [1.0, 4.0]})
-    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", keep_crs=True)
     >>> counts = count_voxels(fleet, Grid.from_bounds(fleet.bounds, crs=fleet.crs), height=3.0)
     >>> counts.layers, counts.key.tolist(), counts.count.tolist()
     (2, [0, 2, 5, 7], [1, 1, 1, 1])

@@ -168,7 +168,7 @@ def trace_breaks(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool
     Examples
     --------
     >>> table = pd.DataFrame({"trace_id": 1, "t": [0, 1, 2, 60, 61, 99], "x": [0.0, 9, 18, 98, 107, 107], "y": 0.0})
-    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", keep_crs=True)
     >>> trace_breaks(fleet).tolist()
     [True, False, False, True, False, False]
     """

@@ -25,7 +25,7 @@ from probe2road.bounds import NotNegative
 from probe2road.errors import OptionError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import finish_edges
-from probe2road.graph.topology import Network, chains, contract_short_edges, joined_lines, mates
+from probe2road.graph.topology import Topology, chains, contract_short_edges, joined_lines, mates
 from probe2road.options import checked
 
 __all__ = [
@@ -338,12 +338,12 @@ def merge_degree_two_nodes(graph: RoadGraph) -> RoadGraph:
     return replace(graph, nodes=nodes, edges=finish_edges(merged), turns=turns)
 
 
-def _network(graph: RoadGraph) -> Network:
+def _network(graph: RoadGraph) -> Topology:
     """Take a graph apart into arrays; heights stay with the vertices."""
     u, v = graph.end_rows.T
     lines = graph.edges.geometry.to_numpy()
     vertices = shapely.get_coordinates(lines, include_z=bool(shapely.has_z(lines).any()))
-    return Network(
+    return Topology(
         position=shapely.get_coordinates(graph.nodes.geometry.to_numpy()),
         u=u.copy(),  # not a column of a table that is read-only: one type of array for the kernels
         v=v.copy(),

@@ -20,13 +20,13 @@ import shapely
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["Network", "chains", "contract_short_edges", "end_nodes", "joined_lines", "mates"]
+__all__ = ["Topology", "chains", "contract_short_edges", "end_nodes", "joined_lines", "mates"]
 
 _FADE = 1.5  # times the distance of two contracted nodes; within it edges are led straight to the new node
 
 
 @dataclass(frozen=True)
-class Network:
+class Topology:
     """A network of N nodes and E edges with P vertices in D dimensions.
 
     Attributes
@@ -125,7 +125,9 @@ def joined_lines(
     return joined
 
 
-def contract_short_edges(network: Network, *, max_length: float, max_ring: float) -> tuple[Network, NDArray[np.int64]]:
+def contract_short_edges(
+    network: Topology, *, max_length: float, max_ring: float
+) -> tuple[Topology, NDArray[np.int64]]:
     """Contract edges between two junctions that are at most ``max_length`` long, shortest first.
 
     Edges on a ring with a perimeter of more than ``2 max_length`` up to ``max_ring`` are left alone; a smaller
@@ -142,7 +144,7 @@ def contract_short_edges(network: Network, *, max_length: float, max_ring: float
         stands_for = moved_to[stands_for]
 
 
-def _lengths(network: Network) -> NDArray[np.float64]:
+def _lengths(network: Topology) -> NDArray[np.float64]:
     """Length of every edge in plan."""
     step = np.hypot(*np.diff(network.vertices[:, :2], axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(step)])
@@ -150,7 +152,7 @@ def _lengths(network: Network) -> NDArray[np.float64]:
 
 
 def _shortest_candidates(
-    network: Network, length: NDArray[np.float64], max_length: float, max_ring: float
+    network: Topology, length: NDArray[np.float64], max_length: float, max_ring: float
 ) -> NDArray[np.int64]:
     """List the edges to contract in this round; no two of them share a node."""
     u, v = network.u, network.v
@@ -211,8 +213,8 @@ def _ring_lengths(
 
 
 def _contracted(
-    network: Network, length: NDArray[np.float64], short: NDArray[np.int64], hole: float
-) -> tuple[Network, NDArray[np.int64]]:
+    network: Topology, length: NDArray[np.float64], short: NDArray[np.int64], hole: float
+) -> tuple[Topology, NDArray[np.int64]]:
     """Contract edges that share no node, each to the weighted middle of its nodes."""
     a, b = np.minimum(network.u[short], network.v[short]), np.maximum(network.u[short], network.v[short])
     weight, position = network.weight.copy(), network.position.copy()
@@ -245,7 +247,7 @@ def _contracted(
     return _without_flat_edges(result), moved_to
 
 
-def _without_flat_edges(network: Network) -> Network:
+def _without_flat_edges(network: Topology) -> Topology:
     """Leave out edges that have lost all extent: loops without a vertex besides their node."""
     fine = _lengths(network) > 0
     if fine.all():

@@ -216,7 +216,7 @@ def frame(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[Traversals,
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(3), "x": [40.0, 90, 140], "y": [2.0, 1, -1]})
-    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", keep_crs=True)
     >>> driven, fixes = frame(graph, fleet, match(graph, fleet))
     >>> driven.low.tolist(), driven.high.tolist(), fixes.left.tolist()
     ([40.0, 0.0], [100.0, 40.0], [2.0, 1.0, -1.0])

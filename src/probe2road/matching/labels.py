@@ -85,7 +85,7 @@ def label(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions | None = 
     >>> reference = graph_from_lines([[(0, 0), (240, 0)], [(240, 0), (240, 90)]], crs="EPSG:32616")
     >>> there = pd.DataFrame({"t": range(15), "x": np.arange(5.0, 155, 10), "y": 1.0})
     >>> drives = pd.concat([there.assign(trace_id=k) for k in range(4)])
-    >>> fleet = fleet_from_tables(drives, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(drives, crs="EPSG:32616", keep_crs=True)
     >>> label(reference, fleet).edges[["reference_edge", "length", "support"]].values.tolist()
     [[0, 80.0, 4], [0, 80.0, 4]]
     """

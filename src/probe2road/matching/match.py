@@ -132,7 +132,7 @@ def match(
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 80)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(5), "x": [20.0, 60, 90, 101, 500], "y": [1.0, 0, 2, 40, 500]})
-    >>> found = match(graph, fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616"))
+    >>> found = match(graph, fleet_from_tables(table, crs="EPSG:32616", keep_crs=True))
     >>> found.fixes["edge"].tolist()
     [0, 0, 0, 1, <NA>]
     >>> found.fixes["reason"].iloc[-1]
@@ -187,7 +187,7 @@ def turn_counts(matches: Matches, graph: RoadGraph) -> pd.DataFrame:
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(4), "x": [130.0, 110, 90, 70], "y": 0.0})
-    >>> found = match(graph, fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616"))
+    >>> found = match(graph, fleet_from_tables(table, crs="EPSG:32616", keep_crs=True))
     >>> turn_counts(found, graph).values.tolist()
     [[1, 1, 0, 1]]
     """

@@ -19,13 +19,13 @@ from probe2road.errors import InputError
 from probe2road.graph.direction import driving_direction
 from probe2road.graph.roadgraph import RoadGraph
 
-__all__ = ["Follow", "Grid", "States", "build_follow", "build_states", "edge_weight_array"]
+__all__ = ["CellIndex", "Follow", "States", "build_follow", "build_states", "edge_weight_array"]
 
 _MIN_CELL = 50.0  # m
 _CELLS_PER_PIECE = 4.0
 
 
-class Grid(NamedTuple):
+class CellIndex(NamedTuple):
     """Square cells and the pieces that may touch each; the pieces of cell c are ``piece[first[c]:first[c + 1]]``."""
 
     left: float
@@ -78,7 +78,7 @@ class States(NamedTuple):
     dy: NDArray[np.float64]
     z: NDArray[np.float64]
     dz: NDArray[np.float64]
-    grid: Grid
+    grid: CellIndex
 
 
 class Follow(NamedTuple):
@@ -247,17 +247,17 @@ def _follow(
 
 def _build_grid(
     x: NDArray[np.float64], y: NDArray[np.float64], dx: NDArray[np.float64], dy: NDArray[np.float64]
-) -> Grid:
+) -> CellIndex:
     """Lay cells over the pieces, about four for each piece and none smaller than 50 m."""
     if not len(x):
-        return Grid(0.0, 0.0, _MIN_CELL, 1, 1, np.zeros(2, np.int64), np.zeros(0, np.int32))
+        return CellIndex(0.0, 0.0, _MIN_CELL, 1, 1, np.zeros(2, np.int64), np.zeros(0, np.int32))
     left, bottom = float(np.minimum(x, x + dx).min()), float(np.minimum(y, y + dy).min())
     width = float(np.maximum(x, x + dx).max()) - left
     height = float(np.maximum(y, y + dy).max()) - bottom
     cell = max(_MIN_CELL, np.sqrt(width * height / (_CELLS_PER_PIECE * len(x))))
     columns, rows = int(width / cell) + 1, int(height / cell) + 1
     first, piece = _fill_grid(x, y, dx, dy, left, bottom, cell, columns, rows)
-    return Grid(left, bottom, float(cell), columns, rows, first, piece)
+    return CellIndex(left, bottom, float(cell), columns, rows, first, piece)
 
 
 @njit(cache=True)

@@ -86,7 +86,7 @@ def rasterize(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> NDA
     >>> import pandas as pd
     >>> from probe2road.fleet.contract import fleet_from_tables
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(3), "x": [900.5, 902.5, 904.5], "y": [0.5, 0.5, 2.5]})
-    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", keep_crs=True)
     >>> rasterize(fleet, Grid.from_bounds(fleet.bounds, crs=fleet.crs))[0]
     array([[0, 0, 0, 0, 1],
            [0, 0, 0, 1, 0],

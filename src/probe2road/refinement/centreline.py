@@ -111,7 +111,7 @@ def refine_centreline(
     >>> there = pd.DataFrame({"t": range(40), "x": np.arange(5.0, 400, 10), "y": -1.5})
     >>> drives = [there.assign(trace_id=k) for k in range(3)]
     >>> drives += [there.assign(trace_id=k, x=there["x"][::-1].to_numpy(), y=1.5) for k in range(3, 6)]
-    >>> fleet = fleet_from_tables(pd.concat(drives), crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(pd.concat(drives), crs="EPSG:32616", keep_crs=True)
     >>> refined = refine_centreline(graph, fleet, match(graph, fleet))
     >>> bool(np.abs(shapely.get_coordinates(refined.edges.geometry)[:, 1]).max() < 0.5)
     True

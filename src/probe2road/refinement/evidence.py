@@ -98,7 +98,7 @@ def add_evidence(
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 80)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(4), "x": [80.0, 60, 40, 20], "y": 0.0, "z": 7.0})
-    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", keep_crs=True)
     >>> known = add_evidence(graph, fleet, match(graph, fleet))
     >>> known.edges[["support", "forward", "backward", "speed"]].values.tolist()
     [[1, 0, 1, 20.0], [0, 0, 0, nan]]
@@ -138,7 +138,7 @@ def drive_numbers(fleet: Fleet, *, pause: float = 300.0) -> NDArray[np.int64]:
     >>> from probe2road.fleet.contract import fleet_from_tables
     >>> times = pd.to_datetime(["08:00", "08:10", "08:12", "08:20", "09:00", "09:10"], format="%H:%M", utc=True)
     >>> table = pd.DataFrame({"trace_id": [1, 1, 2, 2, 3, 3], "vehicle_id": "A", "t": times, "x": 500.0, "y": 0.0})
-    >>> fleet = fleet_from_tables(table.assign(x=table.index + 500.0), crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(table.assign(x=table.index + 500.0), crs="EPSG:32616", keep_crs=True)
     >>> drive_numbers(fleet).tolist()
     [0, 0, 1]
     """

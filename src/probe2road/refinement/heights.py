@@ -86,7 +86,7 @@ def with_heights(
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(9), "x": np.arange(10.0, 100, 10), "y": 0.0, "z": 7.0})
-    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", keep_crs=True)
     >>> print(with_heights(graph, fleet, *frame(graph, fleet, match(graph, fleet))).edges.geometry[0])
     LINESTRING Z (0 0 7, 100 0 7)
     """

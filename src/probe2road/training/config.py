@@ -13,7 +13,7 @@ from probe2road.options import checked, load_options
 from probe2road.raster.counts import CHANNELS
 from probe2road.segmentation.losses import LossOptions
 from probe2road.training.samples import SampleOptions
-from probe2road.training.sources import Source
+from probe2road.training.sources import TrainingSource
 
 __all__ = ["SHIPPED", "TrainConfig", "ValidationOptions", "load_config"]
 
@@ -25,7 +25,7 @@ SHIPPED = ("gnss-vision", "gnss", "paper")  # configurations that come with the 
 class ValidationOptions:
     """What chooses the checkpoint: scores on squares that no training sample touches."""
 
-    sources: tuple[Source, ...] = (Source(name="milan"),)  # data sets
+    sources: tuple[TrainingSource, ...] = (TrainingSource(name="milan"),)  # data sets
     squares: Positive[int] = 10  # of each source, spread over it
     size: Positive[int] = 1024  # pixels, side of a square
     every: Positive[int] = 500  # steps
@@ -40,7 +40,7 @@ class TrainConfig:
     seed: NotNegative[int] = 1
     architecture: str = "compact"  # one of `probe2road.segmentation.dlinknet.ARCHITECTURES`
     channels: Annotated[tuple[Annotated[str, OneOf(*CHANNELS)], ...], NotEmpty()] = CHANNELS  # of the input
-    sources: tuple[Source, ...] = (Source(name="columbus", split="train"),)
+    sources: tuple[TrainingSource, ...] = (TrainingSource(name="columbus", split="train"),)
     sample: SampleOptions = field(default_factory=SampleOptions)
     loss: LossOptions = field(default_factory=LossOptions)
     validation: ValidationOptions = field(default_factory=ValidationOptions)

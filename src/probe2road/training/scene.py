@@ -99,7 +99,7 @@ def make_scene(
     >>> from probe2road.fleet.contract import fleet_from_tables
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> table = pd.DataFrame({"trace_id": 7, "t": range(9), "x": np.arange(9.0) * 25, "y": 0.0})
-    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", keep_crs=True)
     >>> reference = graph_from_lines([[(0, 0), (200, 0)]], crs="EPSG:32616")
     >>> scene = make_scene(fleet, reference, pd.DataFrame({"trace_id": [7], "edge": [0]}))
     >>> near = scene.fix_rows[rows_around(scene.fix_cells, scene.table, (30, 0), 40)]

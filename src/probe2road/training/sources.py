@@ -26,7 +26,7 @@ from probe2road.matching.labels import LabelOptions, label_pieces
 from probe2road.options import checked
 from probe2road.training.scene import Scene, load_scene, make_scene, save_scene
 
-__all__ = ["Source", "driven_reference", "members", "open_scene"]
+__all__ = ["TrainingSource", "driven_reference", "members", "open_scene"]
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ _SCENES = "scenes"  # folder of the laid-out scenes, beside the data sets
 
 @dataclass(frozen=True)
 @checked
-class Source:
+class TrainingSource:
     """Fleet data and the roads it was recorded on: either a data set of the benchmark, or files."""
 
     name: str = "columbus"  # of a data set or a group of the benchmark, or what to call your own
@@ -53,7 +53,7 @@ class Source:
             raise OptionError("names nothing to learn from", where="source", fix=fix)
 
 
-def members(sources: Sequence[Source]) -> list[Source]:
+def members(sources: Sequence[TrainingSource]) -> list[TrainingSource]:
     """Replace groups of data sets by their members, which share the weight.
 
     Raises
@@ -63,7 +63,8 @@ def members(sources: Sequence[Source]) -> list[Source]:
 
     Examples
     --------
-    >>> [(source.name, source.weight) for source in members([Source("town-1"), Source("corridors", data="raw")])][:2]
+    >>> sources = [TrainingSource("town-1"), TrainingSource("corridors", data="raw")]
+    >>> [(source.name, source.weight) for source in members(sources)][:2]
     [('town-1', 1.0), ('corridor-1', 0.25)]
     """
     single = []
@@ -73,7 +74,7 @@ def members(sources: Sequence[Source]) -> list[Source]:
     return single
 
 
-def open_scene(source: Source, sets: str | Path) -> Scene:
+def open_scene(source: TrainingSource, sets: str | Path) -> Scene:
     """Return the scene of a source, laid out beside the data sets the first time it is asked for.
 
     Parameters
@@ -104,7 +105,9 @@ def open_scene(source: Source, sets: str | Path) -> Scene:
     return scene
 
 
-def driven_reference(source: Source, sets: str | Path, *, min_drives: int) -> tuple[RoadGraph, shapely.Geometry | None]:
+def driven_reference(
+    source: TrainingSource, sets: str | Path, *, min_drives: int
+) -> tuple[RoadGraph, shapely.Geometry | None]:
     """Return the edges of a data set that enough drives passed, and the area of its split (None for all of it).
 
     Raises
@@ -120,7 +123,7 @@ def driven_reference(source: Source, sets: str | Path, *, min_drives: int) -> tu
     return labelled_reference(read_graph(recording.reference), min_drives=min_drives), area
 
 
-def _make(source: Source, sets: Path) -> Scene:
+def _make(source: TrainingSource, sets: Path) -> Scene:
     """Lay a source out."""
     if source.fleet:
         fleet = read_fleet(source.fleet, source.points or None)
@@ -133,7 +136,7 @@ def _make(source: Source, sets: Path) -> Scene:
     return make_scene(fleet, read_graph(recording.reference), driven, area=area)
 
 
-def _recording(source: Source, sets: str | Path) -> Recording:
+def _recording(source: TrainingSource, sets: str | Path) -> Recording:
     """Return the recording of a data set that is there."""
     recording = Recording(Path(sets) / source.name)
     if not recording.reference.exists():
@@ -142,7 +145,7 @@ def _recording(source: Source, sets: str | Path) -> Recording:
     return recording
 
 
-def _files(source: Source, sets: str | Path) -> list[Path]:
+def _files(source: TrainingSource, sets: str | Path) -> list[Path]:
     """List the files that decide whether a scene is still that of its source."""
     if source.fleet:
         return [Path(path) for path in (source.fleet, source.points, source.reference) if path]

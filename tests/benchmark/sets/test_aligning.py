@@ -15,8 +15,7 @@ from probe2road.benchmark.tables.source import Source, make_fleet
 from probe2road.cli.main import main
 from probe2road.errors import InputError
 from probe2road.io.fleet_reader import read_fleet_files
-from probe2road.training.sources import Source as TrainingSource
-from probe2road.training.sources import open_scene
+from probe2road.training.sources import TrainingSource, open_scene
 
 pytest.importorskip("gtsam", reason="alignment needs the extra 'align'")
 

@@ -11,7 +11,7 @@ from probe2road.simulation.networks.crossings import find_crossings
 from probe2road.simulation.networks.height_check import check_heights
 from probe2road.simulation.networks.network import RoadNetwork, network_from_sections
 from probe2road.simulation.networks.osm import read_network
-from probe2road.simulation.networks.profile import HeightOptions
+from probe2road.simulation.networks.profile import ProfileOptions
 from probe2road.simulation.networks.terrain import Terrain
 
 CRS = "EPSG:32616"
@@ -115,12 +115,12 @@ def test_same_seed_same_heights():
 
 def test_options_set_clearance_and_relief():
     network = network_from_sections([EAST, NORTH], crs=CRS, layer=[0, 1])
-    options = HeightOptions(clearance=8.0, terrain_relief=0.0)
+    options = ProfileOptions(clearance=8.0, terrain_relief=0.0)
     solved = solve_heights(network, rng=np.random.default_rng(0), options=options)
     report = check_heights(solved, options=options)
     assert 8.0 <= report.crossings["clearance"].min() < 8.5
     flat = solve_heights(
-        network_from_sections([EAST], crs=CRS), rng=np.random.default_rng(0), options=HeightOptions(terrain_relief=0.0)
+        network_from_sections([EAST], crs=CRS), rng=np.random.default_rng(0), options=ProfileOptions(terrain_relief=0.0)
     )
     assert np.ptp(flat.vertices()[0][:, 2]) < 1e-6
 

@@ -58,7 +58,7 @@ def trip_lines(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> ND
     >>> from probe2road.fleet.contract import fleet_from_tables
     >>> x = [901.5, 904.5, 901.5, 901.5, 904.5]
     >>> table = pd.DataFrame({"trace_id": [1, 1, 1, 2, 2], "t": range(5), "x": x, "y": 1.5})
-    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", keep_crs=True)
     >>> trip_lines(fleet, Grid.from_bounds((900, 0, 905.5, 2.5), crs="EPSG:32616"))
     array([[ 0,  0,  0,  0,  0,  0],
            [ 0, 64, 64, 64, 64,  0],

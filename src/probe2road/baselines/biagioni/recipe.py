@@ -19,7 +19,7 @@ from probe2road.baselines.biagioni.density import blur_kernel, level_ranks
 from probe2road.baselines.biagioni.gray_skeleton import gray_skeleton
 from probe2road.baselines.biagioni.pruning import prune_segments
 from probe2road.baselines.biagioni.street_map import initial_map, straight_pieces
-from probe2road.baselines.biagioni.traversals import Observations, Runs, good_runs, match_pieces, observe_trips
+from probe2road.baselines.biagioni.traversals import Runs, TripPositions, good_runs, match_pieces, observe_trips
 from probe2road.bounds import NotNegative, OneOf, Positive
 from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.graph.roadgraph import RoadGraph
@@ -154,7 +154,9 @@ def _skeleton(
     return skeleton
 
 
-def _match(observations: Observations, graph: RoadGraph, weight: NDArray[np.float64], options: BiagioniOptions) -> Runs:
+def _match(
+    observations: TripPositions, graph: RoadGraph, weight: NDArray[np.float64], options: BiagioniOptions
+) -> Runs:
     """Match all trips to the straight pieces of a map, and collect the good runs."""
     pieces = straight_pieces(graph)
     way, distance = match_pieces(observations, pieces, weight, options.matcher)

@@ -24,7 +24,7 @@ from probe2road.matching.models import PublishedModel
 from probe2road.matching.network import build_states
 from probe2road.matching.published import match_published
 
-__all__ = ["Observations", "Runs", "good_runs", "match_pieces", "observe_trips"]
+__all__ = ["Runs", "TripPositions", "good_runs", "match_pieces", "observe_trips"]
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ _NO_STEP = 1e12  # m; the observations need no further interpolation
 
 
 @dataclass(frozen=True)
-class Observations:
+class TripPositions:
     """Positions of all trips, no farther apart than the matcher wants them, O in all.
 
     Attributes
@@ -70,14 +70,14 @@ class Runs:
     xy: NDArray[np.float64]
 
 
-def observe_trips(fleet: Fleet, *, step: float, gaps: TraceGaps | None = None) -> Observations:
+def observe_trips(fleet: Fleet, *, step: float, gaps: TraceGaps | None = None) -> TripPositions:
     """Interpolate trips linearly, in position and time, to the fewest equal steps of at most ``step`` m.
 
     Examples
     --------
     >>> from probe2road.fleet.contract import fleet_from_tables
     >>> table = pd.DataFrame({"trace_id": 1, "t": [0, 3, 4], "x": [900.0, 925.0, 930.0], "y": 900.0})
-    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", keep_crs=True)
     >>> found = observe_trips(fleet, step=10.0)
     >>> found.fleet.traces["x"].round(1).tolist(), found.seconds.tolist()
     ([900.0, 908.3, 916.7, 925.0, 930.0], [0.0, 1.0, 2.0, 3.0, 4.0])
@@ -93,11 +93,11 @@ def observe_trips(fleet: Fleet, *, step: float, gaps: TraceGaps | None = None) -
     left = np.cumsum(count)[fix] - 1 - np.arange(len(fix))  # steps to go to the fix
     x, y, seconds = (values[fix] - (left / count[fix])[:, None] * moved[fix]).T
     traces = pd.DataFrame({"trace_id": np.cumsum(breaks)[fix], "t": pd.NaT, "x": x, "y": y, "z": np.nan})
-    return Observations(replace(fleet, traces=traces), fleet.owner[fix], seconds)
+    return TripPositions(replace(fleet, traces=traces), fleet.owner[fix], seconds)
 
 
 def match_pieces(
-    observations: Observations, pieces: Pieces, weight: NDArray[np.float64], model: PublishedModel
+    observations: TripPositions, pieces: Pieces, weight: NDArray[np.float64], model: PublishedModel
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Match every observation to a straight piece.
 
@@ -128,7 +128,7 @@ def match_pieces(
 
 
 def good_runs(
-    observations: Observations,
+    observations: TripPositions,
     pieces: Pieces,
     way: NDArray[np.int64],
     distance: NDArray[np.float64],

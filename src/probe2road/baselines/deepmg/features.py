@@ -103,7 +103,7 @@ def thin_traces(fleet: Fleet, options: FeatureOptions | None = None, *, gaps: Tr
     >>> import pandas as pd
     >>> from probe2road.fleet.contract import fleet_from_tables
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(6), "x": [0.0, 4, 11, 15, 22, 400], "y": 0.0})
-    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", keep_crs=True)
     >>> steps = thin_traces(fleet)
     >>> steps.x.tolist(), steps.valid.tolist(), steps.starts.tolist()
     ([0.0, 11.0, 22.0, 400.0], [False, True, True, False], [0, 3, 4])

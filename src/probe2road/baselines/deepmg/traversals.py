@@ -99,7 +99,7 @@ def count_traversals(
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(200, 0), (100, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(5), "x": [20.0, 60, 90, 130, 170], "y": [1.0, 0, 2, 0, 1]})
-    >>> steps = thin_traces(fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616"))
+    >>> steps = thin_traces(fleet_from_tables(table, crs="EPSG:32616", keep_crs=True))
     >>> count_traversals(steps, graph).tolist()
     [[1, 0], [0, 1]]
     """

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from probe2road.benchmark.sets.datasets import find_dataset
-from probe2road.benchmark.tables.ablations import Ablation, Variant, find_ablations
+from probe2road.benchmark.tables.ablations import Ablation, AblationValue, find_ablations
 from probe2road.benchmark.tables.cells import FULL, Cell, build_cell, score_cells, write_cells
 from probe2road.benchmark.tables.figures import Point, draw_points
 from probe2road.benchmark.tables.intervals import DRAWS, Interval, f1_interval
@@ -109,7 +109,7 @@ def run_ablations(
     return cells
 
 
-def _cell(variant: Variant) -> Cell:
+def _cell(variant: AblationValue) -> Cell:
     """Build and score a variant; of a data set with splits, where it is validated."""
     build_cell(variant.source, variant.method, like=variant.like)
     full = [cell for cell in score_cells(variant.source, variant.method) if cell.stage == FULL]

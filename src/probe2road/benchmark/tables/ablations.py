@@ -16,7 +16,7 @@ from probe2road.recipe import BuildOptions
 from probe2road.segmentation.network import shipped_weights
 from probe2road.segmentation.weights import read_weights
 
-__all__ = ["ABLATIONS", "BASE", "Ablation", "Variant", "find_ablations", "vary"]
+__all__ = ["ABLATIONS", "BASE", "Ablation", "AblationValue", "find_ablations", "vary"]
 
 BASE = METHODS["probe2road"]  # what is varied
 
@@ -36,7 +36,7 @@ Table = Mapping[str, Any]  # options, as TOML has them
 
 
 @dataclass(frozen=True)
-class Variant:
+class AblationValue:
     """One value of an ablation."""
 
     label: str  # on the axis
@@ -57,7 +57,7 @@ class Ablation:
     name: str
     title: str
     axis: str  # what the values are, with unit
-    variants: Sequence[Variant]
+    variants: Sequence[AblationValue]
     default: str  # label
     joined: bool = True  # whether the values are numbers, between which lines mean something
 
@@ -143,7 +143,7 @@ def _traces(source: Source) -> Ablation:
     tables = {f"{value}": {"refinement": {"min_traces": value}} for value in _COUNTS}
     gaps = _of_options("traces", "Drives that a road needs, N", "N", tables, source)
     roads = [
-        Variant(
+        AblationValue(
             f"{value}",
             replace(source, min_drives=value),
             BASE if value == source.min_drives else _graph_only(BASE),
@@ -178,7 +178,7 @@ def _junctions(source: Source) -> Ablation:
 def _poses(source: Source) -> Ablation:
     """Vary how well drives agree; poses that the data set lacks and that cannot be made are left out."""
     sources = [replace(source, poses=poses) for poses in reversed(POSES)]
-    variants = [Variant(one.poses, one, BASE) for one in sources if one.poses == source.poses or _can_be_had(one)]
+    variants = [AblationValue(one.poses, one, BASE) for one in sources if one.poses == source.poses or _can_be_had(one)]
     return Ablation("poses", "Poses", "poses", variants, source.poses, joined=False)
 
 
@@ -191,7 +191,7 @@ def _drives(source: Source) -> Ablation:
     """Vary how many drives a road has; what is scored against stays."""
     sources = {f"{count}": replace(source, drives=count) for count in _DRIVES} | {"all": source}
     variants = [
-        Variant(label, one, METHODS[name] if one is source else _graph_only(METHODS[name]), series)
+        AblationValue(label, one, METHODS[name] if one is source else _graph_only(METHODS[name]), series)
         for name, series in (("probe2road", "network"), ("density", "density segmenter"))
         for label, one in sources.items()
     ]
@@ -204,7 +204,7 @@ def _of_options(
     """Return the ablation of an option from labels and what each sets; the default sets nothing new."""
     methods = {label: vary(f"{name}-{label}".translate(_FOLDER), table) for label, table in tables.items()}
     default = next(label for label, method in methods.items() if method is BASE)
-    variants = [Variant(label, source, method) for label, method in methods.items()]
+    variants = [AblationValue(label, source, method) for label, method in methods.items()]
     return Ablation(name, title, axis, variants, default, joined)
 
 

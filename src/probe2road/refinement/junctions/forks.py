@@ -119,7 +119,7 @@ def move_forks(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: For
     >>> x = np.arange(5.0, 300, 10)
     >>> lanes = [np.zeros(30), np.minimum(0.0, (100 - x) / 10)]
     >>> drives = [pd.DataFrame({"trace_id": k, "t": range(30), "x": x, "y": lanes[k % 2]}) for k in range(8)]
-    >>> fleet = fleet_from_tables(pd.concat(drives), crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(pd.concat(drives), crs="EPSG:32616", keep_crs=True)
     >>> moved = move_forks(graph, fleet, match(graph, fleet))
     >>> bool(abs(moved.nodes.geometry[1].x - 100) < 5), bool(moved.edges["length"][0] < 105)
     (True, True)

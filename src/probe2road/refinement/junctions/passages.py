@@ -127,7 +127,7 @@ def passing_positions(graph: RoadGraph, fleet: Fleet, matches: Matches) -> pd.Da
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (200, 0)]], crs="EPSG:32616")
     >>> table = pd.DataFrame({"trace_id": 1, "t": range(4), "x": [70.0, 90, 110, 130], "y": 0.0, "z": [4.0, 5, 7, 8]})
-    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", target_crs="EPSG:32616")
+    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", keep_crs=True)
     >>> passing_positions(graph, fleet, match(graph, fleet)).values.tolist()
     [[1.0, 1.0, 1.0, 100.0, 0.0, 6.0]]
     """

@@ -16,7 +16,7 @@ from probe2road.simulation.drawn.interchanges import DRAWINGS, draw_overpass
 from probe2road.simulation.drawn.roads import Road, finish
 from probe2road.simulation.drawn.towns import draw_town
 from probe2road.simulation.networks.network import DRIVING_SIDES, RoadNetwork
-from probe2road.simulation.networks.profile import HeightOptions
+from probe2road.simulation.networks.profile import ProfileOptions
 
 __all__ = ["INTERCHANGES", "generate_corridor", "generate_interchange", "generate_town"]
 
@@ -36,7 +36,7 @@ def generate_interchange(
     driving_side: str = "right",
     country: str = "DE",
     crs: str = _CRS,
-    heights: HeightOptions | None = None,
+    heights: ProfileOptions | None = None,
 ) -> RoadNetwork:
     """Draw an interchange of random sizes around the origin.
 
@@ -94,7 +94,7 @@ def generate_corridor(
     driving_side: str = "right",
     country: str = "DE",
     crs: str = _CRS,
-    heights: HeightOptions | None = None,
+    heights: ProfileOptions | None = None,
 ) -> RoadNetwork:
     """Draw a motorway of random curvature with exits, overpasses, and frontage roads or parallel carriageways.
 
@@ -129,7 +129,7 @@ def generate_town(
     driving_side: str = "right",
     country: str = "DE",
     crs: str = _CRS,
-    heights: HeightOptions | None = None,
+    heights: ProfileOptions | None = None,
 ) -> RoadNetwork:
     """Draw the streets of a town, at one level: a grid, or the grown pattern of an old town.
 
@@ -166,7 +166,7 @@ def _finish(
     driving_side: str,
     country: str,
     crs: str,
-    heights: HeightOptions | None,
+    heights: ProfileOptions | None,
 ) -> RoadNetwork:
     """Make the network and say so."""
     if driving_side not in DRIVING_SIDES:

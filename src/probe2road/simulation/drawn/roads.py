@@ -27,7 +27,7 @@ from probe2road.simulation.drawn.curves import Path, Pose, along, offset_path, p
 from probe2road.simulation.lanes.lanes import fade, taper_length
 from probe2road.simulation.networks.altitude import solve_heights
 from probe2road.simulation.networks.network import RoadNetwork, network_from_sections
-from probe2road.simulation.networks.profile import HeightOptions
+from probe2road.simulation.networks.profile import ProfileOptions
 from probe2road.simulation.networks.road_classes import CLASS_DEFAULTS
 
 __all__ = ["Gore", "Road", "carriageway", "finish", "ramp", "split_at"]
@@ -163,7 +163,7 @@ def finish(
     driving_side: str,
     country: str,
     crs: str,
-    heights: HeightOptions | None = None,
+    heights: ProfileOptions | None = None,
 ) -> RoadNetwork:
     """Cut bridges and tunnels, mirror for left-hand traffic, build the network and solve its heights."""
     pieces = _structures(list(roads))

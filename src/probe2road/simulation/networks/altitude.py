@@ -27,10 +27,10 @@ from scipy.sparse import linalg
 
 from probe2road.simulation.networks.crossings import Crossings, find_crossings
 from probe2road.simulation.networks.network import RoadNetwork
-from probe2road.simulation.networks.profile import HeightOptions, bends, grade_limits, steps, vertex_unknowns
+from probe2road.simulation.networks.profile import ProfileOptions, bends, grade_limits, steps, vertex_unknowns
 from probe2road.simulation.networks.terrain import Terrain
 
-__all__ = ["HeightOptions", "solve_heights"]
+__all__ = ["ProfileOptions", "solve_heights"]
 
 logger = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ class _Problem:
 
 
 def solve_heights(
-    network: RoadNetwork, *, rng: np.random.Generator, options: HeightOptions | None = None
+    network: RoadNetwork, *, rng: np.random.Generator, options: ProfileOptions | None = None
 ) -> RoadNetwork:
     """Give every vertex of a network a height.
 
@@ -66,7 +66,7 @@ def solve_heights(
     rng
         Shapes the terrain.
     options
-        What to keep; `HeightOptions` where not given.
+        What to keep; `ProfileOptions` where not given.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def solve_heights(
     >>> bool(report.crossings["clearance"].min() >= 5.5), len(report.violations)
     (True, 0)
     """
-    options = options or HeightOptions()
+    options = options or ProfileOptions()
     started = time.perf_counter()
     crossings = find_crossings(network)
     xyz, offsets = network.vertices()
@@ -113,7 +113,7 @@ def _problem(
     offsets: NDArray[np.int64],
     unknown: NDArray[np.int64],
     crossings: Crossings,
-    options: HeightOptions,
+    options: ProfileOptions,
     rng: np.random.Generator,
 ) -> _Problem:
     """Lay out terrain, grade, change of grade and clearance over the unknowns."""
@@ -161,7 +161,7 @@ _SETTLED = 1e-3  # m; the steps end when no height moves more
 _BEND_FACTOR = 30.0  # bends beyond the limit weigh this much more than those within
 
 
-def _minimise(problem: _Problem, options: HeightOptions) -> tuple[NDArray[np.float64], int]:
+def _minimise(problem: _Problem, options: ProfileOptions) -> tuple[NDArray[np.float64], int]:
     """Minimise the piecewise quadratic by Newton steps; return heights and the number of steps."""
     z, rounds, moved = problem.terrain.copy(), 0, np.inf
     while moved > _SETTLED and rounds < options.max_steps:
@@ -174,7 +174,7 @@ def _minimise(problem: _Problem, options: HeightOptions) -> tuple[NDArray[np.flo
 
 
 def _active_system(
-    problem: _Problem, z: NDArray[np.float64], options: HeightOptions
+    problem: _Problem, z: NDArray[np.float64], options: ProfileOptions
 ) -> tuple[sparse.csr_array, NDArray[np.float64]]:
     """Assemble the normal equations of the terms that are active at z."""
     pull = problem.pull * np.where(problem.open_road & (z < problem.terrain), options.lift, 1.0)

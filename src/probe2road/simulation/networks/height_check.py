@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from probe2road.simulation.networks.crossings import find_crossings
 from probe2road.simulation.networks.network import RoadNetwork
-from probe2road.simulation.networks.profile import HeightOptions, bends, grade_limits, steps, vertex_unknowns
+from probe2road.simulation.networks.profile import ProfileOptions, bends, grade_limits, steps, vertex_unknowns
 
 __all__ = ["HeightReport", "check_heights"]
 
@@ -44,7 +44,7 @@ class HeightReport:
     max_gap: float
 
 
-def check_heights(network: RoadNetwork, *, options: HeightOptions | None = None) -> HeightReport:
+def check_heights(network: RoadNetwork, *, options: ProfileOptions | None = None) -> HeightReport:
     """Measure clearances, grades, vertical radii and continuity from the geometry alone.
 
     Listed as violations are clearances below ``options.clearance``, grades beyond the limit of the class by more than
@@ -60,7 +60,7 @@ def check_heights(network: RoadNetwork, *, options: HeightOptions | None = None)
     >>> check_heights(network).violations[["kind", "section", "other", "value", "limit"]].values.tolist()
     [['clearance', 1, 0, 0.0, 5.5]]
     """
-    options = options or HeightOptions()
+    options = options or ProfileOptions()
     xyz, offsets = network.vertices()
     crossings = find_crossings(network)
     table = crossings.table.assign(clearance=crossings.clearance(xyz[:, 2]))

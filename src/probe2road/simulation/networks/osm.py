@@ -25,7 +25,7 @@ from probe2road.crs import WGS84, local_crs, parse_crs, require_metric, transfor
 from probe2road.errors import InputError, MissingFileError
 from probe2road.simulation.networks.altitude import solve_heights
 from probe2road.simulation.networks.network import NetworkReport, RoadNetwork, network_from_sections
-from probe2road.simulation.networks.profile import HeightOptions
+from probe2road.simulation.networks.profile import ProfileOptions
 from probe2road.simulation.networks.road_classes import CLASS_DEFAULTS
 
 __all__ = ["DRIVABLE", "read_network"]
@@ -79,7 +79,7 @@ def read_network(
     country: str | None = None,
     crs: Any = None,
     rng: np.random.Generator | None = None,
-    heights: HeightOptions | None = None,
+    heights: ProfileOptions | None = None,
 ) -> RoadNetwork:
     """Read the roads of an OSM file as a network with lanes and heights.
 

@@ -14,7 +14,7 @@ from probe2road.options import checked
 from probe2road.simulation.networks.network import RoadNetwork
 from probe2road.simulation.networks.road_classes import CLASS_DEFAULTS
 
-__all__ = ["HeightOptions", "bends", "grade_limits", "steps", "vertex_unknowns"]
+__all__ = ["ProfileOptions", "bends", "grade_limits", "steps", "vertex_unknowns"]
 
 _MIN_STEP = 0.5  # m; vertices nearer than this count as this far apart, so that grades stay finite
 _THROUGH = 60.0  # degrees; the grade continues from one section to the next where the heading changes by less
@@ -22,7 +22,7 @@ _THROUGH = 60.0  # degrees; the grade continues from one section to the next whe
 
 @dataclass(frozen=True)
 @checked
-class HeightOptions:
+class ProfileOptions:
     """What a height profile must keep, and how smooth it is."""
 
     clearance: NotNegative[float] = 5.5  # m, from road surface to road surface
