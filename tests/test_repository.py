@@ -160,13 +160,22 @@ def test_readme_shows_two_commands() -> None:
 
 
 def test_every_module_is_in_the_reference() -> None:
-    pages = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs" / "reference").glob("*.md"))
+    folder = ROOT / "docs" / "reference" / "internals"
+    pages = "\n".join(path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.md")))
     listed = re.findall(r"^::: probe2road\.(\S+)$", pages, re.MULTILINE)
-    documented_by_hand = {"cli.main", "cli.benchmark", "cli.reading"}
+    documented_by_hand = {"__main__", "cli.main", "cli.benchmark", "cli.reading"}
     packages = {name for name, path in MODULES.items() if path.name == "__init__.py"}
     modules = sorted(set(MODULES) - packages - documented_by_hand)
     assert [name for name in modules if not any(f"{name}.".startswith(f"{entry}.") for entry in listed)] == []
     assert [name for name in listed if name not in MODULES] == []
+
+
+def test_everything_at_the_front_door_is_on_the_first_level_of_the_reference() -> None:
+    pages = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs" / "reference").glob("*.md"))
+    listed = re.findall(r"^::: probe2road\.(\S+)$", pages, re.MULTILINE)
+    assert len(listed) == len(set(listed))
+    in_errors = {"Probe2RoadError", "errors"}
+    assert set(listed) | in_errors == {name for name in dir(probe2road) if name not in MODULES} | in_errors
 
 
 def test_relative_links_of_the_root_documents_lead_somewhere() -> None:
