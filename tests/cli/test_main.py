@@ -93,6 +93,14 @@ def test_view_draws_a_page_or_a_picture(folder, built, call, name):
     assert (folder / name).stat().st_size > 10_000
 
 
+def test_view_compares_with_a_reference_in_a_picture_only(folder, built, call):
+    compared = ("view", "roads.gpkg", "--reference", "roads.gpkg", "-o")
+    assert call(*compared, "compared.png")[0] == 0
+    code, _, err = call(*compared, "compared.html")
+    assert code == 2
+    assert "a page shows no reference; use .png" in err
+
+
 def test_intermediate_stages_are_kept_on_request(folder, call):
     options = ("--keep-intermediate", "stages", "--segmenter", "density", "--resolution", "2", "-q")
     assert call("build", "drives.csv", *COLUMNS, *options, "-o", "coarse.gpkg") == (0, "", "")

@@ -256,7 +256,7 @@ def view(
     *,
     traces: Annotated[Path | None, typer.Option(help="Fleet data to show under it.")] = None,
     points: Annotated[Path | None, typer.Option(help="Semantic points to show under it.")] = None,
-    reference: Annotated[Path | None, typer.Option(help="Road graph to compare with, in a PNG.")] = None,
+    reference: Annotated[Path | None, typer.Option(help="Road graph to compare with; only in a PNG.")] = None,
     title: Annotated[str | None, typer.Option(help="Heading; the file's name without it.")] = None,
     fleet_format: Said[FleetFormat],
     graph_format: Said[GraphFormat],
