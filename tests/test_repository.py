@@ -79,6 +79,17 @@ def test_module_imports_only_what_stands_above_it(module: str) -> None:
     assert [name for name in imports(module) if rank(name, order) > rank(module, order)] == []
 
 
+def test_only_explore_takes_the_front_door() -> None:
+    """What is imported as an attribute of the package escapes the layers."""
+    through = [
+        module
+        for module, path in MODULES.items()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Import) and "probe2road" in [alias.name for alias in node.names]
+    ]
+    assert through == ["graph.roadgraph"]
+
+
 def test_every_room_lists_its_parts() -> None:
     for room, listed in parts().items():
         inside = {
