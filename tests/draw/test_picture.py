@@ -8,7 +8,7 @@ import pytest
 from matplotlib.image import imread
 from numpy.typing import NDArray
 
-from probe2road.draw.picture import Stage, draw_graph, write_filmstrip
+from probe2road.draw.picture import Panel, draw_graph, write_filmstrip
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
@@ -32,10 +32,10 @@ def test_the_filmstrip_has_a_panel_per_stage_of_the_same_area(graph: RoadGraph, 
     counts = np.zeros(GRID.shape, np.uint32)
     counts[30, 10:90] = 7
     stages = [
-        Stage("Traces", counts, GRID, "7 traces"),
-        Stage("Probability", (counts / 7).astype(np.float32), GRID),
-        Stage("Skeleton", counts > 0, GRID),
-        Stage("Graph", graph),
+        Panel("Traces", counts, GRID, "7 traces"),
+        Panel("Probability", (counts / 7).astype(np.float32), GRID),
+        Panel("Skeleton", counts > 0, GRID),
+        Panel("Graph", graph),
     ]
     write_filmstrip(stages, tmp_path / "strip.png", bounds=GRID.bounds)
     picture = imread(tmp_path / "strip.png")
@@ -52,7 +52,7 @@ def test_thin_lines_survive_when_the_raster_is_larger_than_the_panel(tmp_path: P
     grid = Grid.from_bounds((0.0, 0.0, 8000.0, 8000.0), crs=UTM)
     skeleton = np.zeros(grid.shape, bool)
     skeleton[4000, :] = True
-    write_filmstrip([Stage("Skeleton", skeleton, grid)], tmp_path / "strip.png", bounds=grid.bounds)
+    write_filmstrip([Panel("Skeleton", skeleton, grid)], tmp_path / "strip.png", bounds=grid.bounds)
     picture = imread(tmp_path / "strip.png")[:, :, :3].mean(axis=2)
     middle = picture[:, picture.shape[1] // 2]
     assert (middle < 0.6).any()
@@ -83,6 +83,6 @@ def test_nothing_to_draw_is_said(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="there is nothing to draw"):
         write_filmstrip([], tmp_path / "nothing.png")
     with pytest.raises(OptionError, match="the array of 'Mask' has no grid"):
-        write_filmstrip([Stage("Mask", np.ones((2, 2), bool))], tmp_path / "nothing.png")
+        write_filmstrip([Panel("Mask", np.ones((2, 2), bool))], tmp_path / "nothing.png")
     draw_graph(empty_graph(UTM), tmp_path / "white.png", bounds=GRID.bounds)
     assert [path.name for path in tmp_path.iterdir()] == ["white.png"]

@@ -30,7 +30,7 @@ __all__ = [
     "ORANGE",
     "PURPLE",
     "SOFT",
-    "Stage",
+    "Panel",
     "draw_graph",
     "save_figure",
     "write_filmstrip",
@@ -51,7 +51,7 @@ _DEAD_END_COLOR = "#c92a2a"
 
 
 @dataclass(frozen=True)
-class Stage:
+class Panel:
     """One panel of a filmstrip.
 
     Attributes
@@ -77,7 +77,7 @@ class Stage:
 
 
 def write_filmstrip(
-    stages: Sequence[Stage], path: str | PathLike[str], *, bounds: Bounds | None = None, columns: int = 5
+    stages: Sequence[Panel], path: str | PathLike[str], *, bounds: Bounds | None = None, columns: int = 5
 ) -> None:
     """Draw the stages of a run side by side, all of the same area, with one scale.
 
@@ -105,7 +105,7 @@ def write_filmstrip(
     >>> from pathlib import Path
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> picture = Path(tempfile.mkdtemp()) / "strip.png"
-    >>> write_filmstrip([Stage("Graph", graph_from_lines([[(0, 0), (100, 50)]], crs="EPSG:32616"))], picture)
+    >>> write_filmstrip([Panel("Graph", graph_from_lines([[(0, 0), (100, 50)]], crs="EPSG:32616"))], picture)
     >>> picture.read_bytes()[1:4]
     b'PNG'
     """
@@ -216,7 +216,7 @@ def _common_bounds(boxes: list[Bounds]) -> Bounds:
     return float(left - margin), float(bottom - margin), float(right + margin), float(top + margin)
 
 
-def _stage_bounds(stage: Stage) -> Bounds:
+def _stage_bounds(stage: Panel) -> Bounds:
     """Return the bounds of a graph, or of the pixels of an array that are not zero."""
     if isinstance(stage.content, RoadGraph):
         return stage.content.bounds

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from probe2road.draw.picture import Stage, write_filmstrip
+from probe2road.draw.picture import Panel, write_filmstrip
 from probe2road.fleet.contract import Fleet
 from probe2road.io.graph_files import read_graph
 from probe2road.raster.counts import rasterize
@@ -36,10 +36,10 @@ def draw_stages(folder: str | Path, fleet: Fleet, path: str | Path) -> None:
     skeleton, _ = read_raster(folder / SKELETON.file())
     traces = rasterize(fleet, grid)[0]
     panels = [
-        Stage("Traces", traces, grid, f"{fleet.n_traces:,} traces, {len(fleet.traces):,} fixes"),
-        Stage("Probability", probability[0], grid, "of a centreline"),
-        Stage("Skeleton", skeleton[0].astype(bool), grid, f"{int(skeleton.sum()):,} pixels"),
-        Stage("Graph", read_graph(folder / VECTORIZED.file())),
-        Stage("Roads", read_graph(folder / ROADS.file())),
+        Panel("Traces", traces, grid, f"{fleet.n_traces:,} traces, {len(fleet.traces):,} fixes"),
+        Panel("Probability", probability[0], grid, "of a centreline"),
+        Panel("Skeleton", skeleton[0].astype(bool), grid, f"{int(skeleton.sum()):,} pixels"),
+        Panel("Graph", read_graph(folder / VECTORIZED.file())),
+        Panel("Roads", read_graph(folder / ROADS.file())),
     ]
     write_filmstrip(panels, path)

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from probe2road.draw.picture import Stage, write_filmstrip
+from probe2road.draw.picture import Panel, write_filmstrip
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster.counts import rasterize
@@ -72,11 +72,11 @@ def draw_place(path: Path, bounds: Bounds, fleet: Fleet, reference: RoadGraph, g
     resolution = max(bounds[2] - bounds[0], bounds[3] - bounds[1]) / _PIXELS
     grid = Grid.from_bounds(bounds, resolution=resolution, crs=fleet.crs)
     below = _within(reference, bounds)
-    panels = [Stage("Traces", rasterize(fleet, grid)[0], grid, "each pixel counts fixes of drives")]
+    panels = [Panel("Traces", rasterize(fleet, grid)[0], grid, "each pixel counts fixes of drives")]
     for title, graph in graphs.items():
         inside = graph.degrees()[graph.nodes.geometry.within(shapely.box(*bounds))]
         caption = f"{(inside >= 3).sum()} junctions, {(inside == 1).sum()} dead ends"
-        panels.append(Stage(title, _within(graph, bounds), caption=caption, reference=below))
+        panels.append(Panel(title, _within(graph, bounds), caption=caption, reference=below))
     write_filmstrip(panels, path, bounds=bounds, columns=_COLUMNS)
 
 
