@@ -9,7 +9,6 @@ import shapely
 
 from probe2road.errors import CRSError, InputError
 from probe2road.graph.check import check_graph
-from probe2road.graph.direction import driving_direction
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.graph.tables import TURN_DTYPES
 
@@ -136,19 +135,3 @@ def test_turns_must_be_possible(tee: RoadGraph, row: tuple[int, ...], message: s
     check_graph(replace(tee, turns=turns.iloc[:1]))
     with pytest.raises(InputError, match=message):
         check_graph(replace(tee, turns=turns))
-
-
-def test_driving_direction_follows_the_tag_and_then_the_counts(tee: RoadGraph) -> None:
-    edges = tee.edges.assign(forward=pd.array([9, 0, None], "Int64"), backward=pd.array([0, 4, None], "Int64"))
-    assert driving_direction(edges).tolist() == [1, 0, 0]
-    assert driving_direction(edges, min_count=4).tolist() == [1, -1, 0]
-    assert driving_direction(edges.assign(oneway=["no", None, "-1"]), min_count=4).tolist() == [0, -1, -1]
-    assert driving_direction(edges.assign(oneway=[False, True, False])).tolist() == [0, 1, 0]
-
-
-def test_weighed_evidence_outranks_bare_counts() -> None:
-    edges = graph_from_lines([[(0, 0), (90, 0)], [(90, 0), (90, 90)]], crs="EPSG:32616").edges
-    counted = edges.assign(forward=[7, 7], backward=[0, 0])
-    assert driving_direction(counted).tolist() == [1, 1]
-    weighed = counted.assign(oneway=["yes", None], oneway_confidence=[0.95, 0.8])
-    assert driving_direction(weighed).tolist() == [1, 0]

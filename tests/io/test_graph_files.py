@@ -122,12 +122,12 @@ def test_osmium_reads_ways_that_share_the_junction(tee: RoadGraph, tmp_path: Pat
         for node in osmium.FileProcessor(str(tmp_path / name), osmium.osm.NODE)
     }
     assert set(ways) == {-1, -2, -3}
-    assert ways[-1][0][-1] == ways[-2][0][0] == ways[-3][0][0]
+    assert ways[-1][0][-1] == ways[-2][0][-1] == ways[-3][0][0]
     assert max(nodes) < 0
-    assert nodes[ways[-2][0][1]][2] == {"ele": "181.500"}
+    assert nodes[ways[-2][0][-2]][2] == {"ele": "181.500"}
     tags = [tags for _, tags in ways.values()]
     assert [row["highway"] for row in tags] == ["road"] * 3
-    assert [row.get("oneway") for row in tags] == ["yes", "-1", None]
+    assert [row.get("oneway") for row in tags] == ["yes", "yes", None]
     assert tags[0]["probe2road:origin"] == "segmentation"
 
 

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
+import shapely
 
 from probe2road.errors import InputError
 from probe2road.graph.check import check_graph
@@ -45,7 +46,9 @@ def test_ways_are_split_where_they_share_a_node_and_bridges_pass_over(extract: P
     assert sorted(graph.degrees()) == [1, 1, 1, 1, 1, 3]
     assert graph.edges["highway"].tolist() == ["residential", "residential", "service", "motorway"]
     assert graph.edges["name"].fillna("").tolist() == ["Seeweg", "Seeweg", "", ""]
-    assert graph.edges["oneway"].fillna("").tolist() == ["-1", "-1", "", "yes"]
+    assert graph.edges["oneway"].fillna("").tolist() == ["yes", "yes", "", "yes"]
+    drawn = [shapely.get_coordinates(line)[:, 0] for line in graph.edges.geometry]
+    assert [x[0] > x[-1] for x in drawn[:2]] == [True, True]  # the street is driven to the west
     assert graph.edges.loc[3, ["bridge", "layer", "lanes"]].tolist() == ["yes", "1", "3"]
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import geopandas as gpd
 import networkx as nx
 import numpy as np
 import osmnx as ox
@@ -11,6 +12,7 @@ import pytest
 import shapely
 
 from probe2road.errors import CRSError, InputError, OptionError, OutputError
+from probe2road.graph.direction import driving_direction, in_driving_direction
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.io.graph_files import WRITABLE, read_graph, write_graph
 from probe2road.io.graph_networkx import from_networkx, to_networkx
@@ -39,7 +41,7 @@ def test_networkx_has_both_directions_unless_the_counts_say_otherwise(block: Roa
     assert pairs == [
         (0, 1, 0, False, False),
         (1, 0, 0, True, False),
-        (1, 0, 1, True, True),
+        (1, 0, 1, False, True),
         (1, 1, 2, False, False),
         (1, 1, 2, True, False),
     ]
@@ -119,7 +121,45 @@ def test_we_read_graphml_of_osmnx(tmp_path: Path) -> None:
 def test_a_tagged_one_way_street_keeps_its_tag(block: RoadGraph) -> None:
     tagged = replace(block, edges=block.edges.assign(oneway=["yes", "no", "-1"]))
     back = from_networkx(to_networkx(tagged))
-    pd.testing.assert_frame_equal(pd.DataFrame(back.edges), pd.DataFrame(tagged.edges), check_like=True)
+    turned = in_driving_direction(tagged.edges)
+    pd.testing.assert_frame_equal(pd.DataFrame(back.edges), pd.DataFrame(turned), check_like=True)
+    assert back.edges["oneway"].tolist() == ["yes", "no", "yes"]
+
+
+@pytest.mark.parametrize("suffix", sorted(WRITABLE))
+def test_what_is_driven_against_its_line_is_written_turned(block: RoadGraph, tmp_path: Path, suffix: str) -> None:
+    tagged = replace(block, edges=block.edges.assign(oneway=["-1", "no", "yes"]))
+    write_graph(tagged, tmp_path / f"roads{suffix}")
+    if suffix == ".geojson":
+        assert '"-1"' not in (tmp_path / "roads.geojson").read_text()
+    back = read_graph(tmp_path / f"roads{suffix}").edges
+    assert back["oneway"].tolist() == ["yes", "no", "yes"]
+    assert back[["u", "v", "forward", "backward"]].to_numpy().tolist() == [[1, 0, 8, 9], [0, 1, 0, 12], [1, 1, 3, 0]]
+    assert shapely.get_x(shapely.get_point(back.geometry.to_numpy()[0], 0)) == pytest.approx(EAST + 100, abs=0.02)
+
+
+@pytest.mark.parametrize("name", ["roads.gpkg", "roads.parquet", "roads.fgb", "roads.geojson", "roads.shp"])
+@pytest.mark.parametrize(("words", "turned"), [(["-1", "yes"], ["yes", "yes"]), (["TF", "B"], ["FT", "B"])])
+def test_lines_from_elsewhere_are_turned_into_their_driving_direction(
+    tmp_path: Path, name: str, words: list[str], turned: list[str]
+) -> None:
+    lines = [shapely.LineString([(9.0, 48.0), (9.01, 48.0)]), shapely.LineString([(9.01, 48.0), (9.02, 48.0)])]
+    table = gpd.GeoDataFrame({"oneway": words}, geometry=lines, crs="EPSG:4326")
+    table.to_parquet(tmp_path / name) if name.endswith("parquet") else table.to_file(tmp_path / name)
+    edges = read_graph(tmp_path / name).edges
+    edges = edges.loc[edges.centroid.x.sort_values().index]  # FlatGeobuf has an order of its own
+    assert edges["oneway"].tolist() == turned
+    assert len(set(edges["u"])) == 1  # both start where they meet
+    assert len({line.coords[0] for line in edges["geometry"]}) == 1
+    assert driving_direction(edges).tolist() == [1, int(turned[1] == "yes")]
+
+
+def test_a_directed_edge_from_elsewhere_is_driven_as_it_runs_whatever_its_tag() -> None:
+    foreign = nx.MultiDiGraph(crs=UTM)
+    foreign.add_nodes_from([(7, {"x": EAST, "y": NORTH}), (9, {"x": EAST + 30, "y": NORTH})])
+    foreign.add_edge(9, 7, oneway="-1")
+    edges = from_networkx(foreign).edges
+    assert edges[["u", "v", "oneway"]].to_numpy().tolist() == [[9, 7, True]]
 
 
 @pytest.mark.parametrize("suffix", sorted(WRITABLE))
@@ -201,5 +241,6 @@ def test_another_metric_crs_can_be_asked_for(block: RoadGraph, tmp_path: Path, s
     graph = read_graph(tmp_path / f"roads{suffix}", target_crs="EPSG:32615")
     assert graph.crs.to_epsg() == 32615
     back = graph.to_crs(UTM)
-    moved = shapely.get_coordinates(back.edges.geometry) - shapely.get_coordinates(block.edges.geometry)
+    driven = in_driving_direction(block.edges)
+    moved = shapely.get_coordinates(back.edges.geometry) - shapely.get_coordinates(driven.geometry)
     assert np.abs(moved).max() < 0.02

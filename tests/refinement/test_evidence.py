@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from probe2road.errors import CRSError, InputError, OptionError, OutputError
 from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
-from probe2road.graph.direction import driving_direction
+from probe2road.graph.direction import driving_direction, oneway_probabilities
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.matching.frame import edge_lines, frame, smooth_stations, stations_along
@@ -23,7 +23,6 @@ from probe2road.refinement.evidence import (
     EvidenceOptions,
     add_evidence,
     drive_numbers,
-    oneway_probabilities,
 )
 from probe2road.refinement.heights import HeightOptions
 from probe2road.simulation.drawn.generate import generate_interchange
@@ -213,7 +212,7 @@ def test_wrong_matches_and_crs_are_refused(tee: RoadGraph) -> None:
         add_evidence(tee.to_crs("EPSG:32617"), data, found)
 
 
-@pytest.mark.parametrize("wrong", [{"min_cover": -1.0}, {"wrong_way": 0.0}])
+@pytest.mark.parametrize("wrong", [{"min_cover": -1.0}, {"max_interval": float("nan")}])
 def test_options_out_of_range(wrong: dict[str, float]) -> None:
     with pytest.raises(OptionError, match=next(iter(wrong))):
         EvidenceOptions(**wrong)

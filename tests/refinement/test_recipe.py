@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+import shapely
 
 from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
@@ -49,3 +50,12 @@ def test_a_bridge_that_the_mask_lost_becomes_one_road_over_the_others() -> None:
 def test_without_proof_it_stays_in_pieces(gaps: dict[str, float]) -> None:
     graph = refined(graph_from_lines(LOST, crs=CRS), **gaps)
     assert sorted(graph.edges["length"].round())[-1] < 700.0
+
+
+def test_one_way_edges_run_in_their_driving_direction() -> None:
+    against = [[(500, 0), (-200, 0)], [(100, 300), (100, -300)], [(180, -300), (180, 300)]]
+    edges = refine(graph_from_lines(against, crs=CRS), drives(12)).edges
+    assert edges["oneway"].tolist() == ["yes"] * 3
+    assert edges[["u", "v", "forward", "backward"]].to_numpy().tolist() == [[1, 0, 12, 0], [3, 2, 12, 0], [4, 5, 12, 0]]
+    first, last = (shapely.get_coordinates(shapely.get_point(edges.geometry.to_numpy(), end)) for end in (0, -1))
+    assert (last - first).sum(axis=1) == pytest.approx([700, 600, 600], abs=1.0)

@@ -1,29 +1,205 @@
-"""Which way an edge may be driven: one rule for tags and for counts."""
+"""Which way an edge may be driven: one table of words, and one rule for counts.
+
+Strategy: what a map or a sign says comes first (a column ``oneway``), in the words of OpenStreetMap or of GIS files.
+Where nothing is said, the drives are weighed: three models of how traversals fall on the two directions compete, and
+the winner counts once it is certain enough. Refinement does this once and writes the result into ``oneway``; a graph
+that has bare counts is judged by the same rule whenever it is asked.
+
+An edge that is open one way only is stored in its driving direction: `in_driving_direction` turns the others.
+"""
 
 from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
 
 import geopandas as gpd
 import numpy as np
 import pandas as pd
+import shapely
+from numpy.typing import NDArray
+from scipy.special import betaln
 
-__all__ = ["driving_direction"]
+from probe2road.bounds import Positive, Probability
+from probe2road.options import checked
+
+__all__ = [
+    "DIRECTION_TAGS",
+    "ONEWAY_TAGS",
+    "ONEWAY_WORDS",
+    "WAYS",
+    "DirectionOptions",
+    "counted_direction",
+    "driving_direction",
+    "in_driving_direction",
+    "oneway_probabilities",
+    "tagged_direction",
+    "told_direction",
+]
+
+WAYS = (1, -1, 0)  # from u to v only, from v to u only, both: the columns of `oneway_probabilities`
+ONEWAY_TAGS = {1: "yes", -1: "-1", 0: "no"}  # what OpenStreetMap writes for them
+ONEWAY_WORDS = {
+    **{"yes": 1, "true": 1, "1": 1, "1.0": 1},
+    **{"-1": -1, "-1.0": -1, "reverse": -1},
+    **{"no": 0, "false": 0, "0": 0, "0.0": 0},
+    **{"reversible": 0, "alternating": 0},  # one way at a time, but each at some time
+    **{"f": 1, "t": -1, "b": 0},  # extracts of OSM for GIS: from, to, both
+    **{"ft": 1, "tf": -1},  # GIS networks: from-to, to-from
+}  # what is read, in lower case
+
+DIRECTION_TAGS = ("oneway", "highway", "junction")  # tags that say which way a way of OpenStreetMap may be driven
+_IMPLYING_CLASSES = ("motorway", "motorway_link")
+_IMPLYING_JUNCTIONS = ("roundabout", "circular")
+_TURNED_LETTERS = {"t": "F", "tf": "FT"}
+_SIDES = {"forward": "backward", "backward": "forward", "left": "right", "right": "left"}
+_SIDE = re.compile(rf"(?<![a-z])({'|'.join(_SIDES)})(?![a-z])")
 
 
-def driving_direction(edges: gpd.GeoDataFrame, *, min_count: int = 5) -> pd.Series:
+@dataclass(frozen=True)
+@checked
+class DirectionOptions:
+    """When counts call an edge one-way, or open both ways."""
+
+    min_confidence: Probability = 0.9  # probability from which the counts decide
+    wrong_way: Probability = 0.02  # share of traversals of a one-way road that are matched the wrong way
+    imbalance: Positive[float] = 2.0  # a of Beta(a, a), the law of the share of one direction on two-way roads
+    oneway_share: Probability = 0.5  # of edges that are one-way, before anything was counted
+
+
+def told_direction(oneway: pd.Series) -> pd.Series:
+    """Read the values of a column ``oneway``: 1 as the line is drawn, -1 against it, 0 both ways.
+
+    Upper and lower case are alike, numbers and flags are read like their text. A word that is not in `ONEWAY_WORDS`
+    says nothing.
+
+    Parameters
+    ----------
+    oneway
+        Text, numbers or flags.
+
+    Returns
+    -------
+    Series of Int64
+        NA where nothing is said.
+
+    Examples
+    --------
+    >>> told_direction(pd.Series(["Yes", "-1", "reversible", "TF", "perhaps", None])).tolist()
+    [1, -1, 0, -1, <NA>, <NA>]
+    >>> told_direction(pd.Series([True, False])).tolist(), told_direction(pd.Series([1.0, float("nan")])).tolist()
+    ([1, 0], [1, <NA>])
+    """
+    words = oneway.astype("str").str.strip().str.lower()
+    return words.map(ONEWAY_WORDS).astype("Int64")
+
+
+def tagged_direction(tags: pd.DataFrame) -> pd.Series:
+    """Say which way ways of OpenStreetMap may be driven, by their tags.
+
+    Where ``oneway`` says nothing, motorways, their links and roundabouts are one-way as drawn. For motorway links
+    this is what routers do, and how most are mapped.
+
+    Parameters
+    ----------
+    tags
+        One row for each way, with any of `DIRECTION_TAGS` as columns.
+
+    Returns
+    -------
+    Series of Int64
+        1 as drawn, -1 against it, 0 both ways, NA where the tags say nothing.
+
+    Examples
+    --------
+    >>> tags = pd.DataFrame({"highway": ["motorway", "motorway", "primary"], "oneway": [None, "no", None]})
+    >>> tagged_direction(tags).tolist()
+    [1, 0, <NA>]
+    """
+    tags = tags.reindex(columns=list(DIRECTION_TAGS))
+    implied = tags["highway"].isin(_IMPLYING_CLASSES) | tags["junction"].isin(_IMPLYING_JUNCTIONS)
+    return told_direction(tags["oneway"]).mask(lambda told: told.isna() & implied, 1)
+
+
+def oneway_probabilities(
+    forward: NDArray[np.float64], backward: NDArray[np.float64], *, options: DirectionOptions | None = None
+) -> NDArray[np.float64]:
+    """Return the probabilities that edges are one-way from u to v, one-way from v to u, or open both ways.
+
+    Bayes' law for three models of how traversals fall on the two directions: all but a few wrongly matched ones on
+    one, or on both in a share that follows a Beta distribution.
+
+    Parameters
+    ----------
+    forward, backward
+        Shape (n,): traversals.
+    options
+        ``wrong_way``, ``imbalance``, ``oneway_share``.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+
+    Examples
+    --------
+    >>> oneway_probabilities(np.array([0.0, 9, 9]), np.array([0.0, 0, 4])).round(2).tolist()
+    [[0.25, 0.25, 0.5], [0.9, 0.0, 0.1], [0.01, 0.0, 0.99]]
+    """
+    options = options or DirectionOptions()
+    wrong = 1.0 / options.wrong_way - 1.0  # b of Beta(1, b), whose mean is the share
+    even = options.imbalance
+    log = np.stack(
+        [
+            np.log(options.oneway_share / 2) + betaln(forward + wrong, backward + 1.0) - betaln(wrong, 1.0),
+            np.log(options.oneway_share / 2) + betaln(forward + 1.0, backward + wrong) - betaln(1.0, wrong),
+            np.log(1 - options.oneway_share) + betaln(forward + even, backward + even) - betaln(even, even),
+        ],
+        axis=-1,
+    )
+    likelihood = np.exp(log - log.max(axis=-1, keepdims=True))
+    return likelihood / likelihood.sum(axis=-1, keepdims=True)
+
+
+def counted_direction(edges: pd.DataFrame, *, options: DirectionOptions | None = None) -> pd.Series:
+    """Say which way edges may be driven by their counts alone, where these are certain enough.
+
+    Parameters
+    ----------
+    edges
+        With ``forward`` and ``backward``; missing counts are none.
+    options
+        The defaults where it is None: nine drives one way, and none the other, make an edge one-way.
+
+    Returns
+    -------
+    Series of Int64, indexed like the edges
+        1, -1 or 0 as in `driving_direction`; NA where the counts leave it open.
+
+    Examples
+    --------
+    >>> counted_direction(pd.DataFrame({"forward": [9, 8, 40, 0, 3], "backward": [0, 0, 1, 9, 3]})).tolist()
+    [1, <NA>, 1, -1, 0]
+    """
+    options = options or DirectionOptions()
+    forward, backward = (edges[name].to_numpy(np.float64, na_value=0.0) for name in ("forward", "backward"))
+    probability = oneway_probabilities(forward, backward, options=options)
+    best = pd.Series(np.array(WAYS)[probability.argmax(axis=1)], index=edges.index, dtype="Int64")
+    return best.mask((probability.max(axis=1) < options.min_confidence) | (forward + backward == 0))
+
+
+def driving_direction(edges: pd.DataFrame) -> pd.Series:
     """Say which way each edge may be driven: 1 from u to v only, -1 from v to u only, 0 both ways.
 
-    A column ``oneway`` that came with the data (an OSM tag, or a flag) decides where it has a value. Where
-    `probe2road.refinement.evidence` weighed the counts already (column ``oneway_confidence``) and left the value open,
-    the edge is open both ways. Otherwise the counts decide: an edge that was driven ``min_count`` times or more, always
-    the same way, is one-way. On a two-way road with even traffic, five traversals agree by chance once in sixteen
-    times; where the counts are fewer or missing, the edge is open both ways.
+    The column ``oneway`` decides where it says something (see `told_direction`): it holds what a map says, or what
+    `probe2road.refinement.evidence` made of the drives. An edge whose drives were weighed there (it has a value of
+    ``oneway_confidence``) but whose ``oneway`` was left open is open both ways. For all others the counts decide
+    (`counted_direction`), and where they are too few the edge is open both ways.
 
     Parameters
     ----------
     edges
         Edge table of a graph.
-    min_count
-        Traversals needed to call an edge one-way.
 
     Returns
     -------
@@ -33,20 +209,61 @@ def driving_direction(edges: gpd.GeoDataFrame, *, min_count: int = 5) -> pd.Seri
     --------
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> edges = graph_from_lines([[(0, 0), (9, 0)], [(9, 0), (9, 9)], [(9, 9), (0, 0)]], crs="EPSG:32616").edges
-    >>> driving_direction(edges.assign(forward=[7, 0, 2], backward=[0, 9, 0])).tolist()
+    >>> edges = edges.assign(forward=[12, 0, 2], backward=[0, 9, 0])
+    >>> driving_direction(edges).tolist()
     [1, -1, 0]
+    >>> driving_direction(edges.assign(oneway=["no", None, "yes"])).tolist()
+    [0, -1, 1]
     """
-    forward, backward = (edges[name].to_numpy(np.float64, na_value=0.0) for name in ("forward", "backward"))
-    direction = pd.Series(0, index=edges.index, name="direction")
-    if "oneway_confidence" not in edges:
-        direction[(forward >= min_count) & (backward == 0)] = 1
-        direction[(backward >= min_count) & (forward == 0)] = -1
+    direction = counted_direction(edges)
+    if "oneway_confidence" in edges:
+        direction = direction.mask(edges["oneway_confidence"].notna())
     if "oneway" in edges:
-        tag = edges["oneway"].astype("str").str.lower()
-        for value, tags in (
-            (1, ("yes", "true", "1", "1.0")),
-            (-1, ("-1", "-1.0", "reverse")),
-            (0, ("no", "false", "0")),
-        ):
-            direction[tag.isin(tags)] = value
-    return direction
+        direction = told_direction(edges["oneway"]).fillna(direction)
+    return direction.fillna(0).astype("int64").rename("direction")
+
+
+def in_driving_direction(edges: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """Turn the edges that are open from v to u only, so that every one-way edge runs as it is driven.
+
+    Of a turned edge ``u`` and ``v`` change places, the line runs the other way, and so do the values of columns that
+    come in pairs (``forward`` and ``backward``, ``lanes:left`` and ``lanes:right``); ``oneway`` says ``yes``, or 1
+    where it is a number. Ids, keys, heights and turns stay: turns name edges and nodes. Matches made before do not fit
+    any more, because they say where on the line a fix lies. A table without such edges is returned as it is.
+
+    Examples
+    --------
+    >>> from probe2road.graph.roadgraph import graph_from_lines
+    >>> edges = graph_from_lines([[(0, 0), (9, 0)]], crs="EPSG:32616").edges.assign(oneway="-1")
+    >>> turned = in_driving_direction(edges)
+    >>> turned[["u", "v", "oneway"]].values.tolist(), str(turned.geometry[0])
+    ([[1, 0, 'yes']], 'LINESTRING (9 0, 0 0)')
+    """
+    against = (driving_direction(edges) == -1).to_numpy()
+    if not against.any():
+        return edges
+    lines = edges.geometry.to_numpy().copy()
+    lines[against] = shapely.reverse(lines[against])
+    opposite = {name: _other_side(name) for name in edges if isinstance(name, str)} | {"u": "v", "v": "u"}
+    turned: dict[str, Any] = {
+        name: edges[name].mask(against, edges[other])
+        for name, other in opposite.items()
+        if other != name and other in edges
+    }
+    if "oneway" in edges:
+        turned["oneway"] = _turned_words(edges["oneway"])
+    return edges.assign(**turned).set_geometry(lines, crs=edges.crs)
+
+
+def _other_side(name: str) -> str:
+    """Name the column that holds the same for the other direction, or side, of a line."""
+    return _SIDE.sub(lambda side: _SIDES[side[0]], name)
+
+
+def _turned_words(oneway: pd.Series) -> pd.Series:
+    """Say "as drawn" where a column says "against it", in its own words."""
+    against = (told_direction(oneway) == -1).fillna(False).to_numpy(bool)
+    if pd.api.types.is_numeric_dtype(oneway.dtype):
+        return oneway.mask(against, 1)
+    words = oneway.astype("str").str.strip().str.lower()
+    return oneway.mask(against, words.map(_TURNED_LETTERS).astype(object).fillna(ONEWAY_TAGS[1]))

@@ -10,28 +10,24 @@ import pandas as pd
 import shapely
 
 from probe2road.crs import WGS84, crs_to_text, transform
-from probe2road.graph.direction import driving_direction
+from probe2road.graph.direction import driving_direction, in_driving_direction
 from probe2road.graph.tables import degrees, edges_with_turns
 
 __all__ = ["present", "to_networkx"]
 
 
-def to_networkx(
-    nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame, turns: pd.DataFrame, *, min_count: int = 5
-) -> nx.MultiDiGraph:
+def to_networkx(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame, turns: pd.DataFrame) -> nx.MultiDiGraph:
     """Return the tables of a graph as OSMnx has its graphs: a ``MultiDiGraph`` in the metric CRS.
 
     An edge that is open both ways becomes two directed edges, the second with ``reversed`` true, its geometry
-    turned and its counts swapped; one-way edges become one (see `probe2road.graph.direction.driving_direction`).
-    Both carry the id in ``edge``. Missing values are left out. The result passes
+    turned and its counts swapped; one-way edges become one, in the direction in which they are driven (see
+    `probe2road.graph.direction`). Both carry the id in ``edge``. Missing values are left out. The result passes
     ``osmnx.convert.validate_graph``, unless it is empty, which OSMnx does not allow.
 
     Parameters
     ----------
     nodes, edges, turns
         Of a `probe2road.graph.roadgraph.RoadGraph`.
-    min_count
-        Traversals needed to call an edge one-way.
 
     Returns
     -------
@@ -51,11 +47,12 @@ def to_networkx(
     result = nx.MultiDiGraph(crs=crs_to_text(edges.crs), created_with="probe2road")
     result.add_nodes_from(zip(nodes.index.tolist(), present(_with_positions(nodes, edges)), strict=True))
 
-    direction = driving_direction(edges, min_count=min_count).to_numpy()
+    edges = in_driving_direction(edges)
+    two_way = (driving_direction(edges) == 0).to_numpy()
     edges = edges_with_turns(edges, turns)
     edges = edges.rename(columns={"oneway": "oneway_tag"})
     edges["osmid"] = edges["osmid"] if "osmid" in edges else edges["edge"]
-    edges["oneway"] = direction != 0
+    edges["oneway"] = ~two_way
     backward = edges.assign(
         reversed=True,
         geometry=shapely.reverse(edges.geometry.to_numpy()),
@@ -63,9 +60,9 @@ def to_networkx(
         backward=edges["forward"],
     ).rename(columns={"u": "v", "v": "u"})
     # Both directions of a loop join the same pair of nodes: the second needs a key of its own.
-    loop = (edges["u"] == edges["v"]).to_numpy() & (direction == 0)
+    loop = (edges["u"] == edges["v"]).to_numpy() & two_way
     backward.loc[loop, "key"] += edges["key"].max() + 1 if loop.any() else 0
-    for table in (edges.assign(reversed=False)[direction >= 0], backward[direction <= 0]):
+    for table in (edges.assign(reversed=False), backward[two_way]):
         ends = (table[name].tolist() for name in ("u", "v", "key"))
         attributes = present(pd.DataFrame(table.drop(columns=["u", "v", "key"])))
         result.add_edges_from(zip(*ends, attributes, strict=True))

@@ -2,8 +2,8 @@
 
 An edge is a stretch of centreline between two nodes; nodes are junctions and dead ends. The graph is a
 multigraph: loops and parallel edges are ordinary, which is why edges have an id of their own and node pairs
-do not identify them. Geometry runs from ``u`` to ``v``; an edge is drivable both ways unless its forward
-and backward counts say otherwise.
+do not identify them. Geometry runs from ``u`` to ``v``, on a one-way edge in its driving direction; which edges are
+one-way is told by `probe2road.graph.direction`.
 """
 
 from __future__ import annotations
@@ -136,9 +136,9 @@ class RoadGraph:
         edges["length"] = edges.length
         return replace(self, nodes=self.nodes.to_crs(target), edges=edges)
 
-    def to_networkx(self, *, min_count: int = 5) -> nx.MultiDiGraph:
+    def to_networkx(self) -> nx.MultiDiGraph:
         """Return an OSMnx ``MultiDiGraph``; see `probe2road.graph.networkx.to_networkx`."""
-        return to_networkx(self.nodes, self.edges, self.turns, min_count=min_count)
+        return to_networkx(self.nodes, self.edges, self.turns)
 
     def plot(self, column: str | None = None, *, ax: Axes | None = None, **style: Any) -> Axes:
         """Draw the edges with matplotlib, as ``GeoDataFrame.plot`` does.

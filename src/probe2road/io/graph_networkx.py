@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from probe2road.crs import local_crs, parse_crs, require_metric
 from probe2road.errors import CRSError, InputError
 from probe2road.graph.check import require_sound
+from probe2road.graph.direction import told_direction
 from probe2road.graph.ends import end_rows
 from probe2road.graph.networkx import present
 from probe2road.graph.roadgraph import RoadGraph
@@ -29,16 +30,18 @@ _DERIVED_NODE_COLUMNS = ("x", "y", "lon", "lat", "street_count")  # made by to_n
 _END_TOLERANCE = 0.01  # m; ends of foreign edges this near their node are moved onto it
 
 
-def to_networkx(graph: RoadGraph, *, min_count: int = 5) -> nx.MultiDiGraph:
+def to_networkx(graph: RoadGraph) -> nx.MultiDiGraph:
     """Return an OSMnx ``MultiDiGraph``; see `probe2road.graph.networkx.to_networkx`."""
-    return graph.to_networkx(min_count=min_count)
+    return graph.to_networkx()
 
 
 def from_networkx(graph: nx.Graph, *, target_crs: Any = None) -> RoadGraph:
     """Return the road graph of a NetworkX graph made by `to_networkx` or OSMnx.
 
-    Of a foreign graph, two directed edges with the same geometry become one edge open both ways; edges without
-    geometry are straight; lists of values become text, separated by ``;``; edges without extent are left out.
+    Of a foreign graph, two directed edges with the same geometry become one edge open both ways. One that stands
+    alone is one-way as it runs if its ``oneway`` says so, whichever way: the tag may be that of the way it was made
+    of. Edges without geometry are straight; lists of values become text, separated by ``;``; edges without extent are
+    left out.
 
     Parameters
     ----------
@@ -133,7 +136,7 @@ def _from_foreign(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame) -> RoadGraph
     single = ~twins.duplicated(keep=False)
     edges = edges[~twins.duplicated()]
     if "oneway" in edges:
-        edges = edges.assign(oneway=edges["oneway"].map(_flag) & single[edges.index])
+        edges = edges.assign(oneway=told_direction(edges["oneway"]).fillna(0).ne(0).astype(bool) & single[edges.index])
 
     position = nodes.get_coordinates().to_numpy()
     u, v = position[end_rows(nodes, edges).T]
@@ -157,10 +160,6 @@ def _towards(lines: NDArray[Any], u: NDArray[np.float64]) -> NDArray[Any]:
     first, last = (shapely.get_coordinates(shapely.get_point(lines, end)) for end in (0, -1))
     turned = np.hypot(*(last - u).T) < np.hypot(*(first - u).T)
     return np.where(turned, shapely.reverse(lines), lines)
-
-
-def _flag(value: Any) -> bool:
-    return value is True or str(value).lower() in ("true", "yes", "1")
 
 
 def _single_value(value: Any) -> Any:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import warnings
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from pyproj import CRS
 
 from probe2road.crs import WGS84, local_crs, parse_crs, require_metric
 from probe2road.errors import CRSError, InputError
+from probe2road.graph.direction import in_driving_direction
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table
 from probe2road.io.graph_writers import parquet_siblings
@@ -116,6 +118,9 @@ def graph_from_table(
 ) -> RoadGraph:
     """Make a graph of a table of lines: our own edges as they were, any others as a reference graph.
 
+    One-way edges run in their driving direction: a line whose ``oneway`` says that it is driven against its course
+    is turned.
+
     Raises
     ------
     InputError
@@ -147,7 +152,7 @@ def graph_from_table(
         kinds = ", ".join(sorted({str(kind) for kind in table.geom_type.dropna()})) or "no geometry"
         raise InputError(f"holds no lines ({kinds})", where=where, fix="give a file with road centrelines")
     logger.info("%s: %d lines became %s", where, len(table), graph)
-    return graph
+    return replace(graph, edges=in_driving_direction(graph.edges))
 
 
 def _edge_layer(layers: list[str], wanted: str | None, path: Path) -> str:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OutputError
 from probe2road.graph.check import require_sound
+from probe2road.graph.direction import in_driving_direction
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import (
     EDGE_DTYPES,
@@ -51,6 +52,8 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f]")
 def outgoing(graph: RoadGraph, *, where: object) -> RoadGraph:
     """Return the graph as it may leave: without private columns, in plain types, edges in order of id.
 
+    One-way edges run in their driving direction.
+
     Raises
     ------
     OutputError
@@ -70,7 +73,11 @@ def outgoing(graph: RoadGraph, *, where: object) -> RoadGraph:
     for name, table in (("nodes", graph.nodes), ("edges", graph.edges), ("turns", graph.turns)):
         for column in table.columns.drop("geometry", errors="ignore"):
             _refuse_private(table[column], name, where)
-    nodes, edges, turns = graph.nodes.sort_index(), graph.edges.sort_index(), graph.turns.reset_index(drop=True)
+    nodes, edges, turns = (
+        graph.nodes.sort_index(),
+        in_driving_direction(graph.edges.sort_index()),
+        graph.turns.reset_index(drop=True),
+    )
     edges = edges.set_geometry(_uniform_dimension(edges.geometry.to_numpy()), crs=edges.crs)
     for table in (nodes, edges, turns):
         table.attrs = {}  # pandas writes them into Parquet
@@ -121,7 +128,7 @@ def graph_from_edge_table(
     turns: pd.DataFrame | None = None,
     where: object,
 ) -> RoadGraph:
-    """Put a graph together from edges that carry `OWN_COLUMNS`, in a metric CRS.
+    """Put a graph together from edges that carry `OWN_COLUMNS`, in a metric CRS; one-way edges run as they are driven.
 
     Parameters
     ----------
@@ -147,7 +154,7 @@ def graph_from_edge_table(
         key = edges["key"].astype("int64")
         edges = edges.set_geometry(without_unknown_heights(edges.geometry.to_numpy()), crs=table.crs)
         text = [name for name in edges if name not in EDGE_DTYPES and pd.api.types.is_object_dtype(edges[name].dtype)]
-        edges = finish_edges(edges.astype(dict.fromkeys(text, "str"))).assign(key=key)
+        edges = in_driving_direction(finish_edges(edges.astype(dict.fromkeys(text, "str"))).assign(key=key))
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(
             f"the columns of the edges are damaged ({error})", where=where, fix="write it again"

@@ -12,18 +12,25 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.special import betaln
 
-from probe2road.bounds import NotNegative, Positive, Probability
+from probe2road.bounds import NotNegative
 from probe2road.crs import require_same_crs
 from probe2road.fleet.contract import Fleet
+from probe2road.graph.direction import (
+    ONEWAY_TAGS,
+    WAYS,
+    DirectionOptions,
+    counted_direction,
+    oneway_probabilities,
+    told_direction,
+)
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import FramedFixes, Traversals, edge_lines, frame, robust_sigma
 from probe2road.matching.match import Matches, turn_counts
 from probe2road.options import checked
 from probe2road.refinement.heights import HeightOptions, with_heights
 
-__all__ = ["EVIDENCE_COLUMNS", "EvidenceOptions", "add_evidence", "drive_numbers", "oneway_probabilities"]
+__all__ = ["EVIDENCE_COLUMNS", "EvidenceOptions", "add_evidence", "drive_numbers"]
 
 logger = logging.getLogger(__name__)
 
@@ -40,8 +47,6 @@ EVIDENCE_COLUMNS = (
     "height_spread",  # m, 1 sigma of the heights about the profile
 )
 
-_TURNED = ("yes", "-1", "no")
-
 
 @dataclass(frozen=True)
 @checked
@@ -50,11 +55,8 @@ class EvidenceOptions:
 
     min_cover: NotNegative[float] = 15.0  # m of an edge, or half of a shorter one, that a traversal has to cover
     drive_pause: NotNegative[float] = 300.0  # s; traces of one vehicle that follow each other sooner are one drive
-    min_confidence: Probability = 0.9  # probability from which oneway gets a value
-    wrong_way: Probability = 0.02  # share of traversals of a one-way road that are matched the wrong way
-    imbalance: Positive[float] = 2.0  # a of Beta(a, a), the law of the share of one direction on two-way roads
-    oneway_share: Probability = 0.5  # of edges that are one-way, before anything was counted
     max_interval: NotNegative[float] = 60.0  # s; longer intervals between fixes do not count for the speed
+    direction: DirectionOptions = field(default_factory=DirectionOptions)  # when counts give oneway a value
     heights: HeightOptions = field(default_factory=HeightOptions)  # how heights are estimated
 
 
@@ -66,7 +68,8 @@ def add_evidence(
     Counts are 0, and measured values missing, where nobody drove. A value of ``oneway`` that the graph has already is
     kept, because a sign outranks traffic; its ``oneway_confidence`` then says how well traffic agrees. Heights replace
     those of the graph where the fleet has any, and vertices are added where the profile bends; the course in plan
-    stays the same to the last bit.
+    stays the same to the last bit. No edge is turned, because the matches say where on its line a fix lies: an edge
+    that is driven from v to u only says ``-1`` here, until `probe2road.graph.direction.in_driving_direction` turns it.
 
     Parameters
     ----------
@@ -114,12 +117,12 @@ def add_evidence(
         "spread": robust_sigma(fixes.left, driven.edge[fixes.traversal], len(graph.edges)),
     }
     edges = graph.edges.assign(**counted, **measured)
-    known = replace(graph, edges=edges.assign(**_oneway(edges, options)), turns=turn_counts(matches, graph))
+    known = replace(graph, edges=edges.assign(**_oneway(edges, options.direction)), turns=turn_counts(matches, graph))
     known = with_heights(known, fleet, driven, fixes, options=options.heights)
     logger.info(
         "%d of %d edges and %d turns were driven; %d edges are one-way, %d are not",
         int((edges["support"] > 0).sum()), len(edges), len(known.turns),
-        int(known.edges["oneway"].isin(_TURNED[:2]).sum()), int((known.edges["oneway"] == "no").sum()),
+        int(known.edges["oneway"].isin(["yes", "-1"]).sum()), int((known.edges["oneway"] == "no").sum()),
     )  # fmt: skip
     return known
 
@@ -161,45 +164,6 @@ def drive_numbers(fleet: Fleet, *, pause: float = 300.0) -> NDArray[np.int64]:
     return pd.factorize(drive)[0].astype(np.int64)
 
 
-def oneway_probabilities(
-    forward: NDArray[np.float64], backward: NDArray[np.float64], *, options: EvidenceOptions | None = None
-) -> NDArray[np.float64]:
-    """Return the probabilities that edges are one-way from u to v, one-way from v to u, or open both ways.
-
-    Bayes' law for three models of how traversals fall on the two directions: all but a few wrongly matched ones on
-    one, or on both in a share that follows a Beta distribution.
-
-    Parameters
-    ----------
-    forward, backward
-        Shape (n,): traversals.
-    options
-        ``wrong_way``, ``imbalance``, ``oneway_share``.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-
-    Examples
-    --------
-    >>> oneway_probabilities(np.array([0.0, 9, 9]), np.array([0.0, 0, 4])).round(2).tolist()
-    [[0.25, 0.25, 0.5], [0.9, 0.0, 0.1], [0.01, 0.0, 0.99]]
-    """
-    options = options or EvidenceOptions()
-    wrong = 1.0 / options.wrong_way - 1.0  # b of Beta(1, b), whose mean is the share
-    even = options.imbalance
-    log = np.stack(
-        [
-            np.log(options.oneway_share / 2) + betaln(forward + wrong, backward + 1.0) - betaln(wrong, 1.0),
-            np.log(options.oneway_share / 2) + betaln(forward + 1.0, backward + wrong) - betaln(1.0, wrong),
-            np.log(1 - options.oneway_share) + betaln(forward + even, backward + even) - betaln(even, even),
-        ],
-        axis=-1,
-    )
-    likelihood = np.exp(log - log.max(axis=-1, keepdims=True))
-    return likelihood / likelihood.sum(axis=-1, keepdims=True)
-
-
 def _counts(
     graph: RoadGraph, fleet: Fleet, driven: Traversals, options: EvidenceOptions
 ) -> dict[str, pd.arrays.IntegerArray]:
@@ -228,24 +192,20 @@ def _counts(
     return {**columns, "vehicle_support": vehicles}
 
 
-def _oneway(edges: pd.DataFrame, options: EvidenceOptions) -> dict[str, Any]:
+def _oneway(edges: pd.DataFrame, options: DirectionOptions) -> dict[str, Any]:
     """Decide the direction of every edge, in the words of OpenStreetMap; what is there already stays."""
+    direction = counted_direction(edges, options=options)
+    if "oneway" in edges:
+        direction = told_direction(edges["oneway"]).fillna(direction)
     forward, backward = (edges[name].to_numpy(np.float64) for name in ("forward", "backward"))
     probability = oneway_probabilities(forward, backward, options=options)
-    best = probability.argmax(axis=1)
-    confidence = probability.max(axis=1)
-    decided = pd.Series(np.array(_TURNED)[best], index=edges.index, dtype="str")
-    decided = decided.mask((confidence < options.min_confidence) | (forward + backward == 0))
-    if "oneway" in edges:
-        text = edges["oneway"].astype("str").str.lower()
-        words = {"yes": 0, "true": 0, "1": 0, "1.0": 0, "-1": 1, "-1.0": 1, "reverse": 1, "no": 2, "false": 2, "0": 2}
-        there = text.map(words)
-        given = there.notna().to_numpy()
-        best = np.where(given, there.fillna(0).to_numpy(np.int64), best)
-        decided = decided.mask(given, pd.Series(np.array(_TURNED)[best], index=edges.index))
-        confidence = probability[np.arange(len(edges)), best]
-    nobody = forward + backward == 0
-    return {"oneway": decided.astype("str"), "oneway_confidence": np.where(nobody, np.nan, confidence)}
+    column = direction.map({way: place for place, way in enumerate(WAYS)}).astype("Int64")
+    chosen = column.fillna(pd.Series(probability.argmax(axis=1), index=edges.index)).to_numpy(np.int64)
+    confidence = probability[np.arange(len(edges)), chosen]
+    return {
+        "oneway": direction.map(ONEWAY_TAGS).astype("str"),
+        "oneway_confidence": np.where(forward + backward == 0, np.nan, confidence),
+    }
 
 
 def _speeds(

@@ -16,6 +16,7 @@ from typing import Annotated
 from probe2road.bounds import Above, AtMost, NotNegative
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.clean import CleanOptions, clean_graph
+from probe2road.graph.direction import in_driving_direction
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.match import Matches, MatchOptions, match
 from probe2road.options import checked
@@ -193,7 +194,8 @@ def refine(
     Returns
     -------
     RoadGraph
-        With evidence on every edge and the turns that were driven. A graph without edges comes back as it is.
+        With evidence on every edge and the turns that were driven, one-way edges in their driving direction. A graph
+        without edges comes back as it is.
 
     Raises
     ------
@@ -236,7 +238,7 @@ def refine(
         if step.stage is not None:
             work.write_graph(step.stage, graph)
         report("refinement", number, len(_STEPS))
-    return graph
+    return replace(graph, edges=in_driving_direction(graph.edges))  # last, because matches follow the lines
 
 
 def _matched(graph: RoadGraph, fleet: Fleet, options: RefineOptions, *, proposed: bool) -> Matches:

@@ -79,7 +79,7 @@ def test_undriven_edges_and_rarely_driven_links_go() -> None:
     pruned = prune_graph(graph, np.array([[1, 0], [4, 5], [0, 0]]))
     assert pruned.edges[["origin", "forward", "backward", "oneway"]].to_numpy().tolist() == [
         ["segmentation", 1, 0, "yes"],
-        ["gap", 0, 5, "-1"],
+        ["gap", 5, 0, "yes"],  # turned: it was driven from its end
     ]
     assert pruned.nodes.index.tolist() == [0, 1, 2]
     assert prune_graph(graph, np.array([[1, 0], [4, 4], [1, 1]])).edges["oneway"].tolist() == ["yes", "no"]

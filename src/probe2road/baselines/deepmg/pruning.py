@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.bounds import NotNegative
+from probe2road.graph.direction import ONEWAY_TAGS, in_driving_direction
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.options import checked
@@ -45,7 +46,7 @@ def prune_graph(graph: RoadGraph, traversals: NDArray[np.int64], options: PruneO
     -------
     RoadGraph
         ``forward`` and ``backward`` are the traversals of the directions that are left, and ``oneway`` says which these
-        are. Of more than two links at a node the shortest are kept.
+        are; edges with one direction run in it. Of more than two links at a node the shortest are kept.
 
     Examples
     --------
@@ -53,7 +54,7 @@ def prune_graph(graph: RoadGraph, traversals: NDArray[np.int64], options: PruneO
     >>> graph = graph_from_lines([[(0, 0), (90, 0)], [(90, 0), (90, 50)], [(90, 0), (99, 0)]], crs="EPSG:32616")
     >>> pruned = prune_graph(graph, np.array([[3, 0], [0, 0], [0, 2]]))
     >>> pruned.edges[["forward", "backward", "oneway"]].values.tolist()
-    [[3, 0, 'yes'], [0, 2, '-1']]
+    [[3, 0, 'yes'], [2, 0, 'yes']]
     """
     options = options or PruneOptions()
     link = graph.edges["origin"].to_numpy() == "gap"
@@ -62,16 +63,18 @@ def prune_graph(graph: RoadGraph, traversals: NDArray[np.int64], options: PruneO
     kept = driven.any(axis=1)
     kept &= ~_in_excess(graph, link & kept, options.max_links)
     counts = np.where(driven, traversals, 0)[kept]
-    oneway = np.where(driven.all(axis=1), "no", np.where(driven[:, 0], "yes", "-1"))[kept]
+    direction = driven[kept] @ [1, -1]
     edges = graph.edges[kept].assign(
-        forward=pd.array(counts[:, 0], "Int64"), backward=pd.array(counts[:, 1], "Int64"), oneway=oneway
+        forward=pd.array(counts[:, 0], "Int64"),
+        backward=pd.array(counts[:, 1], "Int64"),
+        oneway=[ONEWAY_TAGS[way] for way in direction.tolist()],
     )
     nodes = graph.nodes[graph.nodes.index.isin(np.unique(edges[["u", "v"]]))]
     logger.info(
         "kept %d of %d edges of the mask and %d of %d links",
         int((kept & ~link).sum()), int((~link).sum()), int((kept & link).sum()), int(link.sum()),
     )  # fmt: skip
-    return replace(graph, nodes=nodes, edges=finish_edges(edges), turns=empty_turns())
+    return replace(graph, nodes=nodes, edges=in_driving_direction(finish_edges(edges)), turns=empty_turns())
 
 
 def _in_excess(graph: RoadGraph, link: NDArray[np.bool_], most: int) -> NDArray[np.bool_]:

@@ -11,18 +11,18 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import geopandas as gpd
 import numpy as np
-import osmium
 import pandas as pd
 import shapely
 
 from probe2road.crs import WGS84, local_crs, parse_crs, require_metric, transform
-from probe2road.errors import InputError, MissingFileError
+from probe2road.errors import InputError
+from probe2road.graph.direction import DIRECTION_TAGS, tagged_direction
+from probe2road.io.osm_ways import OsmWays, read_restrictions, read_ways, split_at_shared_nodes
 from probe2road.simulation.networks.altitude import solve_heights
 from probe2road.simulation.networks.network import NetworkReport, RoadNetwork, network_from_sections
 from probe2road.simulation.networks.profile import ProfileOptions
@@ -57,18 +57,6 @@ _SPEED = re.compile(r"^\s*(\d+(?:\.\d+)?)\s*(mph|km/h|kmh|kph)?\s*$")
 _SPEED_WORDS = {"none": 130 / 3.6, "walk": 7 / 3.6}  # m/s; Germany's advised speed where there is no limit
 _SPEED_UNKNOWN = ("signals", "variable", "national")  # values that say: look at the class
 _MAX_LANES = 12  # a carriageway has no more lanes than this
-_TRUE = ("yes", "true", "1")
-
-
-@dataclass
-class _Extract:
-    """The parts of an OSM file that matter, as they were read."""
-
-    way_ids: list[int] = field(default_factory=list)
-    refs: list[list[int]] = field(default_factory=list)  # node ids of each way
-    tags: list[dict[str, str]] = field(default_factory=list)
-    positions: dict[int, tuple[float, float]] = field(default_factory=dict)  # node id to (lon, lat)
-    restrictions: list[tuple[str, dict[str, list[int]]]] = field(default_factory=list)  # value, role to members
 
 
 def read_network(
@@ -120,26 +108,25 @@ def read_network(
         ...
     probe2road.errors.MissingFileError: nowhere.osm: no such file; check the path
     """
-    extract = _read_extract(Path(path), tuple(highways))
-    lon, lat = np.array(
-        [extract.positions[ref] for refs in extract.refs for ref in refs if ref in extract.positions]
-        or np.zeros((0, 2))
-    ).T
-    ways, counts = _usable_ways(extract)
-    if not ways:
+    if not Path(path).is_file():
+        raise InputError("no such file", where=path, fix="check the path")
+    found = read_ways(path, highways)
+    placed = found.select_vertices(found.placed)
+    ways = _usable_ways(placed)
+    if not len(ways.ids):
         raise InputError(
             f"no road of class {', '.join(highways)} with two positions or more",
             where=path,
             fix="check that the extract covers the area and has complete ways",
         )
-    side, land = _guess_country(float(np.median(lon)), float(np.median(lat)))
-    target = require_metric(parse_crs(crs)) if crs is not None else local_crs(lon, lat)
-    sections, defaulted, bad = _sections(extract, ways, target)
-    restrictions, unusable = _restrictions(extract, sections)
+    side, land = _guess_country(float(np.median(placed.lon)), float(np.median(placed.lat)))
+    target = require_metric(parse_crs(crs)) if crs is not None else local_crs(placed.lon, placed.lat)
+    sections, defaulted, bad = _sections(ways, target)
+    restrictions, unusable = _restrictions(read_restrictions(path), sections)
     report = NetworkReport(
-        ways=len(extract.way_ids),
-        missing_nodes=counts["missing"],
-        short_ways=counts["short"],
+        ways=len(found.ids),
+        missing_nodes=len(found.refs) - len(placed.refs),
+        short_ways=len(found.ids) - len(ways.ids),
         defaulted=dict(defaulted),
         bad_tags=dict(bad),
         restrictions=len(restrictions),
@@ -156,93 +143,38 @@ def read_network(
     return solve_heights(network, rng=rng if rng is not None else np.random.default_rng(0), options=heights)
 
 
-def _read_extract(path: Path, highways: tuple[str, ...]) -> _Extract:
-    """Read ways of the wanted classes, positions, and turn restrictions."""
-    if not path.is_file():
-        raise MissingFileError("no such file", where=path, fix="check the path")
-    extract, wanted = _Extract(), set(highways)
-    try:
-        for item in osmium.FileProcessor(str(path)):
-            _take(item, extract, wanted)
-    except RuntimeError as error:  # what libosmium raises on malformed files
-        raise InputError(
-            f"cannot be read as OSM data ({error})", where=path, fix="check that the file is complete"
-        ) from error
-    return extract
+def _usable_ways(ways: OsmWays) -> OsmWays:
+    """Drop vertices at the place of the one before, then ways of fewer than two; turn ways that run against traffic."""
+    same_way = np.diff(ways.way, prepend=-1) == 0
+    same_node = np.diff(ways.refs, prepend=0) == 0
+    same_place = (np.diff(ways.lon, prepend=0.0) == 0) & (np.diff(ways.lat, prepend=0.0) == 0)
+    ways = ways.select_vertices(~(same_way & (same_node | same_place)))
+    ways = ways.select_ways(ways.n_nodes > 1)
+    against = (tagged_direction(ways.tag_table(DIRECTION_TAGS)) == -1).fillna(False).to_numpy(bool)
+    place = np.arange(len(ways.refs))
+    return ways.select_vertices(np.lexsort((np.where(against[ways.way], -place, place), ways.way)))
 
 
-def _take(item: Any, extract: _Extract, wanted: set[str]) -> None:
-    """Add one OSM object to the extract."""
-    if item.is_node():
-        if item.location.valid():
-            extract.positions[item.id] = (item.location.lon, item.location.lat)
-    elif item.is_way():
-        if item.tags.get("highway") in wanted:
-            extract.way_ids.append(item.id)
-            extract.refs.append([node.ref for node in item.nodes])
-            extract.tags.append({tag.k: tag.v for tag in item.tags})
-    elif item.is_relation() and item.tags.get("type") == "restriction":
-        members: dict[str, list[int]] = {}
-        for member in item.members:
-            members.setdefault(f"{member.role}_{member.type}", []).append(member.ref)
-        extract.restrictions.append((item.tags.get("restriction", ""), members))
-
-
-def _usable_ways(extract: _Extract) -> tuple[list[tuple[int, list[int]]], Counter[str]]:
-    """Return (row, node ids with a position) of each way with two or more, and count what was left out."""
-    counts: Counter[str] = Counter()
-    ways = []
-    for row, refs in enumerate(extract.refs):
-        known = [ref for ref in refs if ref in extract.positions]
-        counts["missing"] += len(refs) - len(known)
-        places = [extract.positions[ref] for ref in known]
-        known = [ref for i, ref in enumerate(known) if i == 0 or (ref != known[i - 1] and places[i] != places[i - 1])]
-        if len(known) < 2:
-            counts["short"] += 1
-            continue
-        if _oneway(extract.tags[row]) == -1:
-            known.reverse()
-        ways.append((row, known))
-    return ways, counts
-
-
-def _sections(
-    extract: _Extract, ways: list[tuple[int, list[int]]], crs: Any
-) -> tuple[gpd.GeoDataFrame, Counter[str], Counter[str]]:
+def _sections(ways: OsmWays, crs: Any) -> tuple[gpd.GeoDataFrame, Counter[str], Counter[str]]:
     """Split ways at shared nodes and attach what their tags say."""
-    row = np.repeat([way for way, _ in ways], [len(refs) for _, refs in ways])
-    ref = np.array([node for _, refs in ways for node in refs], dtype=np.int64)
-    lonlat = np.array([extract.positions[node] for node in ref.tolist()])
-    x, y = transform(lonlat[:, 0], lonlat[:, 1], WGS84, crs)
-    first = np.flatnonzero(np.diff(np.repeat(np.arange(len(ways)), [len(refs) for _, refs in ways]), prepend=-1))
-    last = np.append(first[1:], len(ref)) - 1
-    _, code, uses = np.unique(ref, return_inverse=True, return_counts=True)
-    cut = uses[code] > 1
-    cut[first], cut[last] = True, True
-    # A vertex that is cut inside a way ends one section and starts the next: it appears twice.
-    inner = cut.copy()
-    inner[first], inner[last] = False, False
-    index = np.repeat(np.arange(len(ref)), 1 + inner)
-    starts = np.zeros(len(index), dtype=bool)
-    starts[np.searchsorted(index, first)] = True
-    starts[np.flatnonzero(np.diff(index) == 0) + 1] = True
-    section = np.cumsum(starts) - 1
-    lines = shapely.linestrings(np.column_stack([x, y])[index], indices=section)
-    head = np.flatnonzero(starts)
-    tail = np.append(head[1:], len(index)) - 1
+    parts = split_at_shared_nodes(ways)
+    drawn = ways.select_vertices(parts.vertex)
+    x, y = transform(drawn.lon, drawn.lat, WGS84, crs)
+    lines = shapely.linestrings(np.column_stack([x, y]), indices=parts.part)
     defaulted: Counter[str] = Counter()
     bad: Counter[str] = Counter()
-    columns = {way: _columns(extract.tags[way], defaulted, bad) for way, _ in ways}
-    table = pd.DataFrame([columns[way] for way in row[index[head]].tolist()])
-    table = table.assign(u=ref[index[head]], v=ref[index[tail]], osm_way=np.array(extract.way_ids)[row[index[head]]])
+    directions = tagged_direction(ways.tag_table(DIRECTION_TAGS)).fillna(0).tolist()
+    columns = [_columns(tags, direction, defaulted, bad) for tags, direction in zip(ways.tags, directions, strict=True)]
+    way_of_section = drawn.way[parts.first]
+    table = pd.DataFrame(columns).iloc[way_of_section].reset_index(drop=True)
+    table = table.assign(u=drawn.refs[parts.first], v=drawn.refs[parts.last], osm_way=ways.ids[way_of_section])
     return gpd.GeoDataFrame(table, geometry=lines, crs=crs), defaulted, bad
 
 
-def _columns(tags: Mapping[str, str], defaulted: Counter[str], bad: Counter[str]) -> dict[str, Any]:
-    """Return the section columns that the tags of one way give; count defaults and nonsense."""
+def _columns(tags: Mapping[str, str], direction: int, defaulted: Counter[str], bad: Counter[str]) -> dict[str, Any]:
+    """Return the section columns that the tags and the direction of one way give; count defaults and nonsense."""
     kind = CLASS_DEFAULTS[tags["highway"]]
-    one_way = _oneway(tags) != 0
-    forward, backward = _lanes(tags, one_way, defaulted, bad)
+    forward, backward = _lanes(tags, direction, defaulted, bad)
     speed = _speed(tags, defaulted, bad)
     layer = _integer(tags, "layer", bad)
     bridge, tunnel = (tags.get(key, "no") != "no" for key in ("bridge", "tunnel"))
@@ -262,24 +194,15 @@ def _columns(tags: Mapping[str, str], defaulted: Counter[str], bad: Counter[str]
     }
 
 
-def _oneway(tags: Mapping[str, str]) -> int:
-    """Return 1 where one-way as drawn, -1 where against it, 0 where two-way."""
-    value = tags.get("oneway", "")
-    if value in ("-1", "reverse"):
-        return -1
-    implied = tags["highway"] in ("motorway", "motorway_link") or tags.get("junction") in ("roundabout", "circular")
-    return int(value in _TRUE or (implied and value not in ("no", "false", "0")))
-
-
-def _lanes(tags: Mapping[str, str], one_way: bool, defaulted: Counter[str], bad: Counter[str]) -> tuple[int, int]:
+def _lanes(tags: Mapping[str, str], direction: int, defaulted: Counter[str], bad: Counter[str]) -> tuple[int, int]:
     """Return the lanes in each direction; ``lanes`` counts both directions of a two-way road."""
     kind = CLASS_DEFAULTS[tags["highway"]]
     total, forward, backward = (_integer(tags, key, bad, low=1) for key in ("lanes", "lanes:forward", "lanes:backward"))
-    if _oneway(tags) == -1:
+    if direction == -1:
         forward, backward = backward, forward
     if total is None and forward is None:
         defaulted["lanes"] += 1
-    if one_way:
+    if direction:
         return total or forward or kind.lanes_oneway, 0
     if forward is None:
         total = total or kind.lanes_twoway
@@ -325,13 +248,15 @@ def _guess_country(lon: float, lat: float) -> tuple[str, str]:
     return ("left", "GB") if left else ("right", "DE")
 
 
-def _restrictions(extract: _Extract, sections: gpd.GeoDataFrame) -> tuple[pd.DataFrame, int]:
+def _restrictions(
+    relations: list[tuple[str, dict[str, list[int]]]], sections: gpd.GeoDataFrame
+) -> tuple[pd.DataFrame, int]:
     """Return the forbidden turns between sections, and the number of relations that could not be used."""
     ends = pd.concat([sections[[end, "osm_way"]].rename(columns={end: "node"}) for end in ("u", "v")])
     at_node = ends.groupby("node")["osm_way"]
     rows: list[tuple[int, int, int]] = []
     unusable = 0
-    for value, members in extract.restrictions:
+    for value, members in relations:
         via, origin, target = (members.get(role, []) for role in ("via_n", "from_w", "to_w"))
         known = len(via) == 1 and via[0] in at_node.groups and origin and target
         if not known or not value.startswith(("no_", "only_")):
