@@ -23,7 +23,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from osmium.filter import KeyFilter, TagFilter
 
-from probe2road.errors import InputError
+from probe2road.errors import InputError, Probe2RoadError
 
 __all__ = [
     "OsmWays",
@@ -123,6 +123,8 @@ def osm_errors(path: str | PathLike[str]) -> Iterator[None]:
     """
     try:
         yield
+    except Probe2RoadError:
+        raise  # ours are ValueErrors, too
     except (RuntimeError, ValueError) as error:
         fault = f"cannot be read as OSM data ({error})"
         raise InputError(fault, where=path, fix="check that it is complete") from error
