@@ -11,13 +11,17 @@ ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 # The theme prints advertising for itself about MkDocs 2 on every build; it is no warning about our pages.
 MKDOCS := NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs
 
-.PHONY: help demo test format lint types docs docs-serve clean
+.PHONY: help demo test format lint types docs docs-serve test-minimum test-all-pythons bench release-check clean
 
 help:
 	@echo 'make demo        set up and run the main job on built-in data; results in demo-output/'
 	@echo 'make test        set up and run every check'
 	@echo 'make format      rewrite the code in the style of the formatter'
 	@echo 'make docs-serve  show the documentation at http://127.0.0.1:8000'
+	@echo 'make test-minimum      run a part of the tests with the oldest dependencies that are declared'
+	@echo 'make test-all-pythons  run the same part with every Python that is installed here, 3.11 to 3.13'
+	@echo 'make bench             time every stage; results in benchmarks/results/'
+	@echo 'make release-check     build what would be released and look into it'
 	@echo 'make clean       remove the virtual environment and everything built'
 
 demo: $(VENV)/.core-installed
@@ -44,8 +48,39 @@ format: $(VENV)/.dev-installed
 	$(BIN)/ruff format
 	$(BIN)/ruff check --fix
 
+# What is quick, touches every dependency of the core, and compiles little.
+QUICK := tests/fleet tests/graph tests/io tests/raster tests/cli tests/test_crs.py tests/test_errors.py tests/test_options.py
+WITHOUT_EXTRAS := pytest pytest-xdist hypothesis osmnx duckdb
+
+test-minimum:
+	$(PYTHON) tools/minimum_versions.py --check
+	test -d .venv-minimum || $(PYTHON) -m venv .venv-minimum
+	.venv-minimum/bin/python -m pip install --quiet --disable-pip-version-check \
+		--constraint constraints-minimum.txt --editable . $(WITHOUT_EXTRAS)
+	$(ONE_THREAD) .venv-minimum/bin/python -m pytest -q -n 2 $(QUICK)
+
+test-all-pythons:
+	@for version in 3.11 3.12 3.13; do \
+		if ! python$$version -c '' 2>/dev/null; then echo "Python $$version: not installed here, left out"; continue; fi; \
+		echo "Python $$version"; \
+		test -d .venv-$$version || python$$version -m venv .venv-$$version || exit 1; \
+		.venv-$$version/bin/python -m pip install --quiet --disable-pip-version-check \
+			--editable . $(WITHOUT_EXTRAS) || exit 1; \
+		$(ONE_THREAD) .venv-$$version/bin/python -m pytest -q -n 2 $(QUICK) || exit 1; \
+	done
+
+bench: $(VENV)/.dev-installed
+	$(ONE_THREAD) $(BIN)/python benchmarks/run_all.py
+
+release-check:
+	rm -rf dist
+	test -d .venv-release || $(PYTHON) -m venv .venv-release
+	.venv-release/bin/python -m pip install --quiet --disable-pip-version-check build
+	.venv-release/bin/python -m build --quiet --outdir dist
+	.venv-release/bin/python tools/check_release.py dist
+
 clean:
-	rm -rf $(VENV) site demo-output .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-minimum .venv-release .venv-3.1[123] dist site demo-output .mypy_cache .pytest_cache .ruff_cache .hypothesis
 
 # The stamps say what the environment holds; both are redone when pyproject.toml or the constraints change.
 $(VENV)/.created:

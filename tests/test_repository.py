@@ -190,7 +190,30 @@ def test_everything_at_the_front_door_is_on_the_first_level_of_the_reference() -
 
 
 def test_relative_links_of_the_root_documents_lead_somewhere() -> None:
-    for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
+    for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "RELEASING.md"):
         text = (ROOT / name).read_text(encoding="utf-8")
         links = [link for link in re.findall(r"\]\(([^)#]+)", text) if "://" not in link]
         assert [link for link in links if not (ROOT / link).exists()] == [], name
+
+
+def test_version_is_that_of_the_citation() -> None:
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {probe2road.__version__}\n" in citation
+
+
+def test_minimum_constraints_are_the_lower_bounds() -> None:
+    command = [sys.executable, ROOT / "tools" / "minimum_versions.py", "--check"]
+    assert subprocess.run(command, capture_output=True, text=True, check=False).stderr == ""
+
+
+def test_hooks_run_the_tools_of_continuous_integration() -> None:
+    hooks = re.findall(r"entry: \.venv/(bin/\S+)", (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))
+    recipes = (ROOT / "Makefile").read_text(encoding="utf-8").replace("$(BIN)", "bin")
+    assert [hook for hook in hooks if hook != "bin/python" and hook not in recipes] == []
+    assert {"bin/ruff", "bin/mypy"} <= set(hooks)
+
+
+def test_make_bench_runs_every_benchmark() -> None:
+    program = (ROOT / "benchmarks" / "run_all.py").read_text(encoding="utf-8")
+    names = [path.stem.removeprefix("bench_") for path in (ROOT / "benchmarks").glob("bench_*.py")]
+    assert [name for name in names if f'    "{name}": [' not in program] == []

@@ -12,7 +12,11 @@ import probe2road.errors
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "probe2road"
 PAGE = (ROOT / "docs" / "guide" / "errors.md").read_text(encoding="utf-8")
-READING_AND_WRITING = ("crs.py", "fleet", "io")  # what every user meets; the rest raises OptionError, or is for developers
+READING_AND_WRITING = (
+    "crs.py",
+    "fleet",
+    "io",
+)  # what every user meets; the rest raises OptionError, or is for developers
 CLASSES = [name for name in probe2road.errors.__all__ if name.endswith("Error")]
 
 
