@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from probe2road.io.formats import FleetFormat
 from probe2road.options import options_from_table
 from probe2road.recipe import BuildOptions
 
@@ -21,4 +22,6 @@ BLOCKS = [
 
 @pytest.mark.parametrize(("page", "block"), BLOCKS, ids=[page for page, _ in BLOCKS])
 def test_block_is_a_configuration_of_build(page: str, block: str) -> None:
-    options_from_table(tomllib.loads(block), BuildOptions, where=page)
+    table = tomllib.loads(block)
+    options_from_table(table.pop("format", {}), FleetFormat, where=page)
+    options_from_table(table, BuildOptions, where=page)
