@@ -1,6 +1,7 @@
 """What a value may be, said in its annotation: bounds for `typing.Annotated`, and the check of one value.
 
-The vocabulary is small on purpose. Four names cover most fields of options, and the bounds cover the others:
+The vocabulary is small on purpose. Four names cover most fields of options: `Positive` (above 0), `NotNegative` (0 or
+more), `Share` (0 to 1, both included) and `Probability` (0 to 1, none included). Bounds cover the others:
 
     reach: Positive[float] = 80.0  # m
     rounds: Annotated[int, AtLeast(1), AtMost(4)] = 1

@@ -199,7 +199,7 @@ def require_same_crs(
     reproject one of them, for example with to_crs
     """
     if not same_crs(first, second):
-        fault = f"{what[0]} in {first.name}, {what[1]} in {second.name}"
+        fault = f"two CRS that differ: {what[0]} in {first.name}, {what[1]} in {second.name}"
         raise CRSError(fault, where=where, fix="reproject one of them, for example with to_crs")
 
 

@@ -110,7 +110,7 @@ def test_intermediate_stages_are_kept_on_request(folder, call):
 
 
 def test_options_come_from_toml(folder, call):
-    (folder / "build.toml").write_text("[density]\nbandwidth = 6\n[clean]\ndead_end = 400\n")
+    (folder / "build.toml").write_text("[segmentation.density]\nbandwidth = 6\n[clean]\ndead_end = 400\n")
     code, _, err = call("build", "drives.csv", *COLUMNS, "--config", "build.toml", "-o", "toml.gpkg", "--no-refine")
     assert code == 0, err
     assert len(read_graph(folder / "toml.gpkg").edges) < 4
@@ -126,7 +126,7 @@ def test_options_come_from_toml(folder, call):
         (["build", "drives.csv", *COLUMNS, "-o", "absent/x.gpkg"], "does not exist; create it first"),
         (["build", "drives.csv", *COLUMNS, "--bbox", "1,2,3", "-o", "x.gpkg"], "left,bottom,right,top"),
         (["build", "drives.csv", "--columns", "trip", "-o", "x.gpkg"], "ours=theirs"),
-        (["build", "drives.csv", *COLUMNS, "--segmenter", "magic", "-o", "x.gpkg"], "use network, density"),
+        (["build", "drives.csv", *COLUMNS, "--segmenter", "magic", "-o", "x.gpkg"], "use network or density"),
         (
             ["build", "drives.csv", *COLUMNS, "--weights", "absent.onnx", "-o", "x.gpkg"],
             "absent.onnx: weights cannot be",
@@ -138,7 +138,7 @@ def test_options_come_from_toml(folder, call):
         (["build", "drives.csv", *COLUMNS, "--config", "wrong.toml", "-o", "x.gpkg"], "there is no option 'bandwith'"),
         (
             ["build", "drives.csv", *COLUMNS, "--config", "type.toml", "-o", "x.gpkg"],
-            "type.toml: resolution is 'fine'; use a number",
+            "type.toml: segmentation: resolution is 'fine'; use a number",
         ),
         (["evaluate", "absent.gpkg", "absent.gpkg"], "absent.gpkg: no such file"),
         (["view", "absent.gpkg", "-o", "roads.pdf"], "use .html or .png"),
@@ -146,8 +146,8 @@ def test_options_come_from_toml(folder, call):
     ],
 )
 def test_bad_input_is_one_clear_error_and_no_output(folder, call, arguments, message):
-    (folder / "wrong.toml").write_text("[density]\nbandwith = 5\n")
-    (folder / "type.toml").write_text("resolution = 'fine'\n")
+    (folder / "wrong.toml").write_text("[segmentation.density]\nbandwith = 5\n")
+    (folder / "type.toml").write_text("[segmentation]\nresolution = 'fine'\n")
     code, _, err = call(*arguments)
     assert code == 2
     assert err.count("error: ") == 1

@@ -140,5 +140,5 @@ def test_a_network_without_lines_shows_nothing():
 
 
 def test_a_camera_that_looks_nowhere_is_refused():
-    with pytest.raises(OptionError, match="field of view"):
+    with pytest.raises(OptionError, match=r"near is 50\.0, far is 40\.0; use near < far"):
         replace(EXACT, near=50.0)
