@@ -15,6 +15,7 @@ from pyproj import CRS
 from probe2road.bounds import NotNegative, Positive
 from probe2road.crs import WGS84, is_true_to_scale, local_crs, parse_crs, require_metric, transform, turn_headings
 from probe2road.errors import CRSError, InputError, OptionError
+from probe2road.fleet.outliers import OutlierOptions, without_impossible_fixes, without_impossible_points
 from probe2road.fleet.tables import (
     POINT_KINDS,
     check_points,
@@ -205,6 +206,7 @@ def fleet_from_tables(
     crs: Any,
     target_crs: Any = None,
     keep_crs: bool = False,
+    outliers: OutlierOptions | None = None,
 ) -> Fleet:
     """Validate two tables and bring them into one local metric CRS.
 
@@ -223,6 +225,9 @@ def fleet_from_tables(
     keep_crs
         Whether to stay in ``crs``, which must then be metric, even where it is not true to scale over the data: for
         drawn or simulated coordinates near the origin of a CRS.
+    outliers
+        Which fixes and points are left out, with a warning, because no vehicle can have been there; the defaults
+        where it is None.
 
     Returns
     -------
@@ -268,7 +273,7 @@ def fleet_from_tables(
     if faults:
         raise InputError.from_faults(faults)
     target = source if keep_crs else target_crs
-    return fleet_from_checked(traces, points, crs=source, points_crs=source, target_crs=target)
+    return fleet_from_checked(traces, points, crs=source, points_crs=source, target_crs=target, outliers=outliers)
 
 
 def fleet_from_checked(
@@ -278,6 +283,7 @@ def fleet_from_checked(
     crs: CRS,
     points_crs: CRS,
     target_crs: Any = None,
+    outliers: OutlierOptions | None = None,
     where: object = None,
 ) -> Fleet:
     """Sort and project tables that `check_traces` and `check_points` have passed; see `fleet_from_tables`.
@@ -289,11 +295,13 @@ def fleet_from_checked(
         traces = sort_fixes(traces, crs, faults)
     if faults:
         raise InputError.from_faults(faults, where=where)
+    traces = without_impossible_fixes(traces, crs, options=outliers, where=where)
     if points is None:
         points = empty_points(traces["trace_id"])
     elif points["trace_id"].dtype != traces["trace_id"].dtype:
         traces = traces.assign(trace_id=traces["trace_id"].astype(str))
         points = points.assign(trace_id=points["trace_id"].astype(str))
+    points = without_impossible_points(points, points_crs, traces, crs, options=outliers)
     target = _metric_target(traces, crs, target_crs, where)
     fleet = Fleet(_projected(traces, crs, target), _projected(points, points_crs, target), target)
     for name, table in (("traces", fleet.traces), ("points", fleet.points)):

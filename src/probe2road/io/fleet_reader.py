@@ -125,7 +125,13 @@ def read_fleet(
         fix = f"bbox is (left, bottom, right, top) in the CRS of the data, {trace_crs.name}"
         raise InputError(f"no fixes inside bbox {format.bbox}", where=where, fix=fix)
     fleet = fleet_from_checked(
-        trace_table, point_table, crs=trace_crs, points_crs=point_crs, target_crs=format.target_crs, where=where
+        trace_table,
+        point_table,
+        crs=trace_crs,
+        points_crs=point_crs,
+        target_crs=format.target_crs,
+        outliers=format.outliers,
+        where=where,
     )
     logger.info(
         "read %d fixes of %d traces and %d semantic points from %s (%s)",

@@ -15,6 +15,7 @@ from pyproj import CRS
 
 from probe2road.crs import parse_crs
 from probe2road.errors import OptionError
+from probe2road.fleet.outliers import OutlierOptions
 
 __all__ = ["BBox", "ColumnMap", "FleetFormat", "GraphFormat", "adjusted"]
 
@@ -50,6 +51,7 @@ class FleetFormat:
     bbox: BBox | None = None  # left, bottom, right, top in the CRS of the files; what is outside is not read
     delimiter: str | None = None  # of text tables; told from the first line where None
     header: bool = True  # whether text tables start with a line of names; else the columns are 0, 1, 2
+    outliers: OutlierOptions = field(default_factory=OutlierOptions)  # what no vehicle can have been at is left out
 
     def __post_init__(self) -> None:
         """Refuse what is no box, no delimiter or no CRS."""
