@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.crs import require_same_crs
-from probe2road.errors import InputError
+from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
 from probe2road.raster.grid import Grid, Window, sparse_zeros
 
@@ -37,6 +37,10 @@ CHANNELS = ("traces", "lane_markings", "road_boundaries")  # the paper's A, B, C
 
 _CACHED_WINDOW = 1024  # pixels; three channels of one row block stay in the processor's cache
 
+_MOST_PIXELS = 20_000_000_000  # where the fleet drove; a byte each is all the memory of a large computer
+_LONGEST_SIDE = 2**31 - 1  # px, that a GeoTIFF can have
+_PLACE = 100.0  # m, side of the squares that tell where the fleet drove
+
 
 def fleet_grid(fleet: Fleet, *, resolution: float = 1.0, margin: float = 50.0) -> Grid:
     """Return the grid that covers all traces of a fleet and a margin (m).
@@ -45,10 +49,25 @@ def fleet_grid(fleet: Fleet, *, resolution: float = 1.0, margin: float = 50.0) -
     ------
     InputError
         If the fleet has no fixes.
+    OptionError
+        If the resolution makes more pixels, where the fleet drove, than a computer can hold.
     """
     if fleet.traces.empty:
         raise InputError("no fixes, so there is no area to map", where="fleet")
-    return Grid.from_bounds(fleet.bounds, resolution=resolution, crs=fleet.crs, margin=margin)
+    grid = Grid.from_bounds(fleet.bounds, resolution=resolution, crs=fleet.crs, margin=margin)
+    pixels = grid.rows * grid.cols
+    if pixels > _MOST_PIXELS:
+        x, y = (np.floor(fleet.traces[axis].to_numpy() / _PLACE).astype(np.int64) for axis in "xy")
+        places = len(np.unique((y - y.min()) * (np.ptp(x) + 1) + x - x.min()))
+        pixels = min(pixels, round(places * (_PLACE / resolution) ** 2))
+    if pixels > _MOST_PIXELS or max(grid.shape) > _LONGEST_SIDE:
+        fault = f"resolution is {resolution:g} m, which makes {pixels:,} pixels where the fleet drove"
+        raise OptionError(
+            f"{fault} ({grid.rows:,} rows and {grid.cols:,} columns in all)",
+            where="fleet_grid",
+            fix=f"use coarser pixels, for example resolution={resolution * 10:g}, or a smaller area",
+        )
+    return grid
 
 
 def rasterize(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> NDArray[np.uint32]:
@@ -125,14 +144,23 @@ def rasterize_windows(
     breaks = trace_breaks(fleet, gaps)
     point_row, point_col = grid.rowcol(fleet.points["x"], fleet.points["y"])
     channel = fleet.points["kind"].cat.codes.to_numpy(np.int64) + 1  # the channels follow POINT_KINDS
-    windows = grid.windows(size, halo=halo)
-    table_shape = -(-grid.rows // size), -(-grid.cols // size)
-    fixes = _members_of_windows(row, col, breaks, size, halo, *table_shape)
-    points = _members_of_windows(point_row, point_col, np.ones(len(point_row), bool), size, halo, *table_shape)
-    for number, window in enumerate(windows):
+    single = np.ones(len(point_row), bool)
+    # Where a fleet is in two cities, the table of windows has no row and no column for what lies between them.
+    rows, cols = (
+        np.flatnonzero(
+            _touched(place, breaks, size, halo, -(-n // size)) | _touched(other, single, size, halo, -(-n // size))
+        )
+        for place, other, n in ((row, point_row, grid.rows), (col, point_col, grid.cols))
+    )
+    ranks = _ranks(rows, -(-grid.rows // size)), _ranks(cols, -(-grid.cols // size))
+    fixes = _members_of_windows(row, col, breaks, size, halo, *ranks)
+    points = _members_of_windows(point_row, point_col, single, size, halo, *ranks)
+    for number in range(len(rows) * len(cols)):
         own_fixes, own_points = (members[offsets[number] : offsets[number + 1]] for offsets, members in (fixes, points))
         if own_fixes.size == 0 and own_points.size == 0:
             continue
+        at_row, at_col = size * int(rows[number // len(cols)]), size * int(cols[number % len(cols)])
+        window = Window(at_row, at_col, min(size, grid.rows - at_row), min(size, grid.cols - at_col), halo)
         top, left = window.row - window.halo, window.col - window.halo
         counts = np.zeros((len(CHANNELS), *window.grid(grid).shape), np.uint32)
         _draw_segments(row, col, breaks, own_fixes, top, left, counts[0])
@@ -181,20 +209,44 @@ def count_pixels(
 
 
 @njit(cache=True)
+def _touched(
+    place: NDArray[np.int64], breaks: NDArray[np.bool_], size: int, halo: int, n_windows: int
+) -> NDArray[np.bool_]:
+    """Mark, along one axis, the windows that a segment from the fix before may touch; see `_members_of_windows`."""
+    touched = np.zeros(n_windows, np.bool_)
+    for fix in range(len(place)):
+        before = fix if breaks[fix] else fix - 1
+        low, high = min(place[fix], place[before]), max(place[fix], place[before])
+        for window in range(max(0, (low - halo) // size), min(n_windows - 1, (high + halo) // size) + 1):
+            touched[window] = True
+    return touched
+
+
+def _ranks(windows: NDArray[np.int64], n_windows: int) -> NDArray[np.int64]:
+    """Return the place of each window along one axis among those that are touched; -1 for the others."""
+    ranks = np.full(n_windows, -1, np.int64)
+    ranks[windows] = np.arange(len(windows))
+    return ranks
+
+
+@njit(cache=True)
 def _members_of_windows(
     row: NDArray[np.int64],
     col: NDArray[np.int64],
     breaks: NDArray[np.bool_],
     size: int,
     halo: int,
-    window_rows: int,
-    window_cols: int,
+    row_ranks: NDArray[np.int64],
+    col_ranks: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """List, for each window of a regular table, the fixes whose segment from the fix before may touch it.
 
-    A fix behind a break stands for itself alone. Returns CSR arrays: offsets ``(n_windows + 1,)``, windows
-    row by row, and the fixes of each, ascending.
+    A fix behind a break stands for itself alone. The ranks number the rows and columns of windows that are touched;
+    the others are not in the table. Returns CSR arrays: offsets ``(n_windows + 1,)``, windows row by row, and the
+    fixes of each, ascending.
     """
+    all_rows, all_cols = len(row_ranks), len(col_ranks)
+    window_rows, window_cols = row_ranks.max() + 1, col_ranks.max() + 1
     offsets = np.zeros(window_rows * window_cols + 1, np.int64)
     members = np.empty(0, np.int64)
     only = np.full(len(row), -1, np.int32)  # most segments touch one window, found in the first pass
@@ -207,8 +259,12 @@ def _members_of_windows(
             before = fix if breaks[fix] else fix - 1
             low_row, high_row = min(row[fix], row[before]), max(row[fix], row[before])
             low_col, high_col = min(col[fix], col[before]), max(col[fix], col[before])
-            top, bottom = max(0, (low_row - halo) // size), min(window_rows - 1, (high_row + halo) // size)
-            left, right = max(0, (low_col - halo) // size), min(window_cols - 1, (high_col + halo) // size)
+            top, bottom = max(0, (low_row - halo) // size), min(all_rows - 1, (high_row + halo) // size)
+            left, right = max(0, (low_col - halo) // size), min(all_cols - 1, (high_col + halo) // size)
+            if top > bottom or left > right:
+                continue
+            top, bottom = row_ranks[top], row_ranks[bottom]  # what lies between them is touched, too
+            left, right = col_ranks[left], col_ranks[right]
             if fill == 0 and top == bottom and left == right:
                 only[fix] = top * window_cols + left
             for i in range(top, bottom + 1):

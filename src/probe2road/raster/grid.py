@@ -15,8 +15,12 @@ from pyproj import CRS
 from probe2road.crs import parse_crs, require_metric
 from probe2road.errors import InputError, OptionError
 from probe2road.io.atomic import atomic_path
+from probe2road.raster.blocks import Blocks
 
-__all__ = ["Grid", "Window", "read_raster", "read_tag", "sparse_zeros", "write_raster"]
+__all__ = ["Grid", "Window", "read_blocks", "read_raster", "read_tag", "sparse_zeros", "write_raster"]
+
+_TILE, _LARGEST_TILE = 256, 4096  # px, side of a tile of a file
+_MOST_TILES = 2**18  # of a file; each takes 16 bytes even where it is empty
 
 
 @dataclass(frozen=True)
@@ -134,7 +138,7 @@ class Window:
 
 def write_raster(
     path: str | Path,
-    array: NDArray[Any],
+    array: NDArray[Any] | Blocks,
     grid: Grid,
     *,
     names: Sequence[str] = (),
@@ -148,7 +152,8 @@ def write_raster(
     path
         File to write.
     array
-        Shape ``(channel, row, col)`` or ``(row, col)``.
+        Shape ``(channel, row, col)`` or ``(row, col)``. Of `probe2road.raster.blocks.Blocks` only the blocks that are
+        there take room in the file.
     grid
         The array's grid.
     names
@@ -160,11 +165,10 @@ def write_raster(
     """
     import rasterio
 
-    bands = array[None] if array.ndim == 2 else array
     profile = {
         "driver": "GTiff",
-        "dtype": "uint8" if bands.dtype == np.bool_ else bands.dtype.name,
-        "count": bands.shape[0],
+        "dtype": "uint8" if array.dtype == np.bool_ else array.dtype.name,
+        "count": 1 if array.ndim == 2 else array.shape[0],
         "height": grid.rows,
         "width": grid.cols,
         "crs": grid.crs.to_wkt(),
@@ -173,13 +177,28 @@ def write_raster(
         "tiled": True,
         "nodata": nodata,
         "bigtiff": "if_safer",
+        "sparse_ok": True,
+        **_tiles(grid),
     }
     with atomic_path(path) as temporary, rasterio.open(temporary, "w", **profile) as target:
-        for number, band in enumerate(bands, start=1):
-            target.write(band.astype(profile["dtype"], copy=False), number)
+        if isinstance(array, Blocks):
+            for row, col, pixels in array.windows():
+                window = rasterio.windows.Window(col, row, pixels.shape[1], pixels.shape[0])
+                target.write(pixels.astype(profile["dtype"], copy=False), 1, window=window)
+        else:
+            for number, band in enumerate(array[None] if array.ndim == 2 else array, start=1):
+                target.write(band.astype(profile["dtype"], copy=False), number)
         for number, name in enumerate(names, start=1):
             target.set_band_description(number, name)
         target.update_tags(**tags or {})
+
+
+def _tiles(grid: Grid) -> dict[str, int]:
+    """Return the size of a file's tiles: of 256 pixels unless their list alone would be large."""
+    side = _TILE
+    while -(-grid.rows // side) * -(-grid.cols // side) > _MOST_TILES and side < _LARGEST_TILE:
+        side *= 2
+    return {"blockxsize": side, "blockysize": side}
 
 
 def sparse_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
@@ -199,7 +218,9 @@ def sparse_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     if size == 0 or not hasattr(mmap, "MAP_PRIVATE"):
         return np.zeros(shape, dtype)
-    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    # Where the system keeps account of memory that was asked for, this is not to be counted before it is used.
+    unreserved = getattr(mmap, "MAP_NORESERVE", 0)
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | unreserved)
     return np.frombuffer(memory, dtype).reshape(shape)
 
 
@@ -215,6 +236,30 @@ def read_tag(path: str | Path, name: str) -> str | None:
     return None if value is None else str(value)
 
 
+def read_blocks(path: str | Path) -> tuple[Blocks, Grid]:
+    """Read the first band of a north-up GeoTIFF and its grid; tiles that are not in the file take no memory.
+
+    Raises
+    ------
+    InputError
+        As `read_raster`.
+    """
+    import rasterio
+
+    try:
+        with rasterio.open(path) as source:
+            grid = _grid_of(source, path)
+            blocks = Blocks(grid.shape, source.dtypes[0])
+            for (row, col), window in source.block_windows(1):
+                if source.get_tag_item(f"BLOCK_OFFSET_{col}_{row}", "TIFF", bidx=1) is not None:
+                    blocks[
+                        window.row_off : window.row_off + window.height, window.col_off : window.col_off + window.width
+                    ] = source.read(1, window=window)
+    except rasterio.errors.RasterioError as error:
+        raise InputError(f"not a readable raster ({error})", where=path) from error
+    return blocks, grid
+
+
 def read_raster(path: str | Path) -> tuple[NDArray[Any], Grid]:
     """Read a north-up GeoTIFF with square pixels: its bands ``(channel, row, col)`` and their grid.
 
@@ -227,11 +272,17 @@ def read_raster(path: str | Path) -> tuple[NDArray[Any], Grid]:
 
     try:
         with rasterio.open(path) as source:
-            transform, crs = source.transform, source.crs
+            grid = _grid_of(source, path)
             array = source.read()
     except rasterio.errors.RasterioError as error:
         raise InputError(f"not a readable raster ({error})", where=path) from error
+    return array, grid
+
+
+def _grid_of(source: Any, path: str | Path) -> Grid:
+    """Return the grid of an open raster."""
+    transform, crs = source.transform, source.crs
     if transform.b or transform.d or not np.isclose(transform.a, -transform.e):
         raise InputError("the raster is rotated or its pixels are not square", where=path, fix="warp it north-up")
     metric = require_metric(CRS.from_user_input(crs) if crs else None, where=path)
-    return array, Grid(transform.c, transform.f, transform.a, array.shape[1], array.shape[2], metric)
+    return Grid(transform.c, transform.f, transform.a, source.height, source.width, metric)

@@ -34,7 +34,8 @@ from probe2road.io.atomic import atomic_path, is_workshop, make_folder, sweep_le
 from probe2road.io.graph_files import read_graph
 from probe2road.io.graph_readers import read_note
 from probe2road.io.graph_writers import write_geopackage
-from probe2road.raster.grid import Grid, read_raster, read_tag, write_raster
+from probe2road.raster.blocks import Blocks
+from probe2road.raster.grid import Grid, read_blocks, read_tag, write_raster
 from probe2road.run.stages import Stage, stage_of
 
 if TYPE_CHECKING:
@@ -86,22 +87,22 @@ class Workspace:
         if self.lock is not None:
             self.lock.release()
 
-    def write_raster(self, stage: Stage, array: NDArray[Any], grid: Grid) -> None:
+    def write_raster(self, stage: Stage, array: NDArray[Any] | Blocks, grid: Grid) -> None:
         """Keep a raster."""
         if self.folder is not None:
             tags = {_RUN: self._fingerprint(stage)}
             write_raster(self.folder / stage.file(), array, grid, names=[stage.name], tags=tags)
 
-    def read_raster(self, stage: Stage, grid: Grid) -> NDArray[Any] | None:
+    def read_raster(self, stage: Stage, grid: Grid) -> Blocks | None:
         """Return the one band of a raster that an earlier run kept on this grid, or None."""
         path = self._kept(stage)
         if path is None or read_tag(path, _RUN) != self._fingerprint(stage):
             return None
-        array, kept_grid = read_raster(path)
+        blocks, kept_grid = read_blocks(path)
         if kept_grid.shape != grid.shape:
             return None
         logger.info("taking %s from an earlier run", path.name)
-        return array[0]
+        return blocks
 
     def write_graph(self, stage: Stage, graph: RoadGraph) -> None:
         """Keep a graph."""

@@ -92,8 +92,7 @@ def lateral_spread(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -
     occupied, first, count = np.unique(cell, return_index=True, return_counts=True)
     busiest = np.lexsort((occupied, -count))[:_PLACES]
     places = first[busiest] + count[busiest] // 2
-    starts = np.searchsorted(cell, np.arange((cell.max(initial=0) // columns + 2) * columns + 1))
-    spreads = _spreads(position, direction, cell, starts, columns, places)
+    spreads = _spreads(position, direction, cell, columns, places)
     order = np.argsort(spreads)[: np.isfinite(spreads).sum()]  # NaN sorts last
     if order.size == 0:
         return float("nan")
@@ -119,14 +118,10 @@ def _spreads(
     position: NDArray[np.float64],
     direction: NDArray[np.float64],
     cell: NDArray[np.int64],
-    starts: NDArray[np.int64],
     columns: int,
     places: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Return the standard deviation across each place, NaN with too few pieces.
-
-    Pieces are sorted by cell; those of cell ``c`` are ``starts[c]`` to ``starts[c + 1]``.
-    """
+    """Return the standard deviation across each place, NaN with too few pieces; pieces are sorted by cell."""
     result = np.full(len(places), np.nan)
     for number in range(len(places)):
         here = places[number]
@@ -134,7 +129,7 @@ def _spreads(
         offsets = [0.0][:0]
         for row_step in range(-1, 2):
             low = cell[here] + row_step * columns - 1
-            for other in range(starts[low], starts[low + 3]):
+            for other in range(np.searchsorted(cell, low), np.searchsorted(cell, low + 3)):
                 step = position[other] - position[here]
                 along = step[0] * ahead[0] + step[1] * ahead[1]
                 across = step[1] * ahead[0] - step[0] * ahead[1]

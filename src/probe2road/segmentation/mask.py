@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,10 @@ from scipy.sparse.csgraph import connected_components
 from probe2road.bounds import Probability
 from probe2road.errors import OptionError
 from probe2road.options import checked
-from probe2road.raster.grid import sparse_zeros
+from probe2road.raster.blocks import Blocks
 from probe2road.segmentation.segmenter import Segmenter
 
 __all__ = ["MaskOptions", "threshold_mask"]
-
-_STRIP = 1024  # rows looked at together
 
 
 @dataclass(frozen=True)
@@ -45,23 +43,34 @@ class MaskOptions:
         return threshold, max(segmenter.seed_threshold, threshold) if seed_threshold is None else seed_threshold
 
 
+@overload
 def threshold_mask(
     probability: NDArray[Any], *, threshold: float, seed_threshold: Probability | None = None
-) -> NDArray[np.bool_]:
+) -> NDArray[np.bool_]: ...
+
+
+@overload
+def threshold_mask(probability: Blocks, *, threshold: float, seed_threshold: Probability | None = None) -> Blocks: ...
+
+
+def threshold_mask(
+    probability: NDArray[Any] | Blocks, *, threshold: float, seed_threshold: Probability | None = None
+) -> NDArray[np.bool_] | Blocks:
     """Return where the probability reaches a threshold, in parts that somewhere reach a higher one.
 
     Parameters
     ----------
     probability
-        Shape ``(rows, cols)``.
+        Shape ``(rows, cols)``; an array, or blocks.
     threshold
-        Probability from which a pixel can belong to a road (METHOD 0.1 row 12).
+        Probability above 0 from which a pixel can belong to a road (METHOD 0.1 row 12).
     seed_threshold
         Probability that an 8-connected part must reach somewhere to be kept; every part is kept where None.
 
     Returns
     -------
     ndarray of bool, shape (rows, cols)
+        Blocks of them where the probability is in blocks.
 
     Raises
     ------
@@ -76,17 +85,14 @@ def threshold_mask(
     seed_threshold = threshold if seed_threshold is None else seed_threshold
     if seed_threshold < threshold:
         raise OptionError(f"seed threshold {seed_threshold} is below threshold {threshold}", where="threshold_mask")
-    rows, cols = probability.shape
-    strips = [
-        np.flatnonzero(probability[top : top + _STRIP] >= threshold) + top * cols for top in range(0, rows, _STRIP)
-    ]
-    pixels = np.concatenate([np.zeros(0, np.int64), *strips])
-    part = _parts(pixels, cols)
+    blocks = probability if isinstance(probability, Blocks) else Blocks.from_array(probability)
+    row, col = blocks.nonzero(at_least=threshold)
+    part = _parts(row * blocks.shape[1] + col, blocks.shape[1])
     certain = np.zeros(part.max(initial=-1) + 1, bool)
-    certain[part[probability.reshape(-1)[pixels] >= seed_threshold]] = True
-    mask = sparse_zeros((rows, cols), bool)
-    mask.reshape(-1)[pixels[certain[part]]] = True
-    return mask
+    certain[part[blocks[row, col] >= seed_threshold]] = True
+    mask = Blocks(blocks.shape, bool)
+    mask.put(row[certain[part]], col[certain[part]], True)
+    return mask if isinstance(probability, Blocks) else mask[:, :]
 
 
 def _parts(pixels: NDArray[np.int64], cols: int) -> NDArray[np.int64]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 
 import numpy as np
-from numpy.typing import NDArray
 
 from probe2road.fleet.contract import Fleet
+from probe2road.raster.blocks import Blocks
 from probe2road.raster.counts import rasterize_windows
-from probe2road.raster.grid import Grid, sparse_zeros
+from probe2road.raster.grid import Grid
 from probe2road.run.progress import Progress, silent
 from probe2road.run.stages import DENSITY, PROBABILITY, WINDOW
 from probe2road.run.workspace import Workspace
@@ -67,7 +67,7 @@ def centreline_probability(
     options: SegmentationOptions,
     workspace: Workspace | None = None,
     progress: Progress | None = None,
-) -> NDArray[np.float32]:
+) -> Blocks:
     """Return the centreline probability of the whole grid.
 
     Parameters
@@ -87,13 +87,13 @@ def centreline_probability(
 
     Returns
     -------
-    ndarray of float32, shape (rows, cols)
-        Pages of memory that nobody drove on are never touched.
+    Blocks of float32, shape (rows, cols)
+        What nobody drove on takes no memory.
     """
     work, report = workspace or Workspace(), progress or silent
     if (kept := work.read_raster(PROBABILITY, grid)) is not None:
         return kept
-    probability = sparse_zeros(grid.shape, np.float32)
+    probability = Blocks(grid.shape, np.float32)
     driven = 0
     for window, counts in rasterize_windows(fleet, grid, size=segmenter.window, halo=segmenter.halo, gaps=options.gaps):
         report("segmentation", window.row, grid.rows)
@@ -105,7 +105,7 @@ def centreline_probability(
         add_window(probability, arrays["probability"], window, segmenter)
         driven += 1
     report("segmentation", grid.rows, grid.rows)
-    total = len(grid.windows(segmenter.window))
+    total = -(-grid.rows // segmenter.window) * -(-grid.cols // segmenter.window)
     logger.info("segmented %d windows of %d of %d px (%s)", driven, total, segmenter.window, segmenter.name)
     work.write_raster(PROBABILITY, probability, grid)
     work.drop(WINDOW)

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError
+from probe2road.raster.blocks import Blocks
 from probe2road.raster.grid import Grid, Window, sparse_zeros
 from probe2road.segmentation.segmenter import Segmenter
 
@@ -120,7 +121,7 @@ def predict_window(segmenter: Segmenter, window: Window, counts: NDArray[Any], g
 
 
 def add_window(
-    probability: NDArray[np.float32], part: NDArray[np.float32], window: Window, segmenter: Segmenter
+    probability: NDArray[np.float32] | Blocks, part: NDArray[np.float32], window: Window, segmenter: Segmenter
 ) -> None:
     """Merge what `predict_window` returned into the probability of the whole area.
 

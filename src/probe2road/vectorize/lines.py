@@ -26,6 +26,7 @@ from probe2road.errors import InputError
 from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.options import checked
+from probe2road.raster.blocks import Blocks
 from probe2road.raster.counts import Grid
 from probe2road.vectorize.skeleton import skeleton_pixels
 from probe2road.vectorize.tracing import PixelGraph, trace_pixels
@@ -47,10 +48,10 @@ class VectorizeOptions:
 
 
 def vectorize(
-    skeleton: NDArray[Any],
+    skeleton: NDArray[Any] | Blocks,
     grid: Grid,
     *,
-    probability: NDArray[Any] | None = None,
+    probability: NDArray[Any] | Blocks | None = None,
     options: VectorizeOptions | None = None,
 ) -> RoadGraph:
     """Turn a one-pixel skeleton into a road graph.
@@ -62,7 +63,7 @@ def vectorize(
     Parameters
     ----------
     skeleton
-        Shape ``(rows, cols)``, from `probe2road.vectorize.skeleton.skeletonize`; an array or a memory map.
+        Shape ``(rows, cols)``, from `probe2road.vectorize.skeleton.skeletonize`; an array, a memory map, or blocks.
     grid
         The skeleton's grid.
     probability
@@ -96,8 +97,11 @@ def vectorize(
     LINESTRING (0.5 1.5, 3.5 1.5)
     """
     for name, array in (("skeleton", skeleton), ("probability", probability)):
-        if array is not None and np.shape(array) != grid.shape:
-            raise InputError(f"shape {np.shape(array)} is not the grid's {grid.shape}", where=name)
+        if array is None:
+            continue
+        shape = array.shape if isinstance(array, Blocks) else np.shape(array)
+        if shape != grid.shape:
+            raise InputError(f"shape {shape} is not the grid's {grid.shape}", where=name)
     pixels = trace_pixels(*skeleton_pixels(skeleton))
     return graph_from_pixels(pixels, grid, probability=probability, options=options)
 
@@ -106,7 +110,7 @@ def graph_from_pixels(
     pixels: PixelGraph,
     grid: Grid,
     *,
-    probability: NDArray[Any] | None = None,
+    probability: NDArray[Any] | Blocks | None = None,
     options: VectorizeOptions | None = None,
 ) -> RoadGraph:
     """Turn traced pixel lines into a road graph, as `vectorize` does; rows and columns are those of the grid."""
@@ -167,7 +171,7 @@ def _simplified(lines: NDArray[Any], loop: NDArray[np.bool_], tolerance: float) 
     return np.where(flat, lines, simple)
 
 
-def _scores(pixels: PixelGraph, probability: NDArray[Any]) -> NDArray[np.float64]:
+def _scores(pixels: PixelGraph, probability: NDArray[Any] | Blocks) -> NDArray[np.float64]:
     """Mean probability at the pixels of every line, its nodes included."""
     row, col = (np.rint(part).astype(np.int64) for part in (pixels.row, pixels.col))
     total = np.add.reduceat(probability[row, col].astype(np.float64), pixels.offsets[:-1])

@@ -20,6 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError, OptionError
+from probe2road.raster.blocks import Blocks
 from probe2road.raster.grid import sparse_zeros
 
 __all__ = ["FIXED", "METHODS", "SET", "Method", "skeleton_pixels", "skeletonize", "skeletonize_windows", "thin_state"]
@@ -82,13 +83,13 @@ def skeletonize(mask: NDArray[Any], *, method: Method = "guo_hall") -> NDArray[n
 
 
 def skeletonize_windows(
-    mask: NDArray[Any],
-    out: NDArray[np.bool_] | None = None,
+    mask: NDArray[Any] | Blocks,
+    out: NDArray[np.bool_] | Blocks | None = None,
     *,
     window: int = 4096,
     halo: int = 64,
     method: Method = "guo_hall",
-) -> NDArray[np.bool_]:
+) -> NDArray[np.bool_] | Blocks:
     """Thin a mask window by window, pixel for pixel as `skeletonize` thins the whole.
 
     Every window runs at most half its halo in iterations, so that what it says about its own pixels is exact.
@@ -98,10 +99,10 @@ def skeletonize_windows(
     Parameters
     ----------
     mask
-        Shape ``(rows, cols)``, an array or a memory map; it is read window by window.
+        Shape ``(rows, cols)``, an array, a memory map, or blocks; it is read window by window.
     out
-        Boolean array or memory map of the same shape to write to; a new array where it is None. It must not
-        share memory with the mask.
+        Boolean array, memory map or blocks of the same shape to write to; a new array, or blocks where the mask is
+        in blocks, where it is None. It must not share memory with the mask.
     window
         Side of a window, pixels.
     halo
@@ -131,7 +132,7 @@ def skeletonize_windows(
     if window < 1 or halo < 2:
         raise OptionError(f"window is {window} and halo is {halo}", fix="use at least 1 and 2 pixels")
     if out is None:
-        out = sparse_zeros((rows, cols), bool)
+        out = Blocks((rows, cols), bool) if isinstance(mask, Blocks) else sparse_zeros((rows, cols), bool)
     if out.shape != (rows, cols):
         raise InputError(f"out has shape {out.shape}, the mask {(rows, cols)}", fix="use the mask's shape")
     while not _thin_windows(mask, out, window, halo, _deletion_table(method)):
@@ -169,7 +170,9 @@ def thin_state(state: NDArray[np.uint8], *, method: Method = "guo_hall") -> None
     _thin(state, _deletion_table(method), _NO_LIMIT, 0)
 
 
-def skeleton_pixels(skeleton: NDArray[Any], *, strip: int = 4096) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def skeleton_pixels(
+    skeleton: NDArray[Any] | Blocks, *, strip: int = 4096
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """List the rows and columns of a skeleton's pixels, sorted; a memory map is read ``strip`` rows at a time.
 
     Raises
@@ -183,37 +186,46 @@ def skeleton_pixels(skeleton: NDArray[Any], *, strip: int = 4096) -> tuple[NDArr
     (array([0, 1]), array([1, 0]))
     """
     rows, _ = _shape_of(skeleton)
+    if isinstance(skeleton, Blocks):
+        return skeleton.nonzero()
     parts = [np.nonzero(np.asarray(skeleton[top : top + strip])) for top in range(0, max(rows, 1), strip)]
     row = np.concatenate([part[0] + number * strip for number, part in enumerate(parts)])
     return row, np.concatenate([part[1] for part in parts])
 
 
-def _thin_windows(mask: NDArray[Any], out: NDArray[np.bool_], window: int, halo: int, table: NDArray[np.bool_]) -> bool:
+def _thin_windows(
+    mask: NDArray[Any] | Blocks, out: NDArray[np.bool_] | Blocks, window: int, halo: int, table: NDArray[np.bool_]
+) -> bool:
     """Thin all windows; False where the halo proves too small for one of them."""
     rows, cols = mask.shape
-    for top in range(0, rows, window):
-        for left in range(0, cols, window):
-            height, width = min(window, rows - top), min(window, cols - left)
-            core = slice(top, top + height), slice(left, left + width)
-            if not np.asarray(mask[core]).any():
-                out[core] = False
-                continue
-            state = _padded_state(mask, top, left, height, width, halo=halo)
-            if _thin(state, table, halo // 2, halo) >= halo // 2:
-                return False
-            inner = state[halo + 1 : halo + 1 + height, halo + 1 : halo + 1 + width]
-            out[core] = inner & _SET
+    if isinstance(mask, Blocks):
+        corners = mask.squares(window)
+    else:
+        corners = [(top, left) for top in range(0, rows, window) for left in range(0, cols, window)]
+    for top, left in corners:
+        height, width = min(window, rows - top), min(window, cols - left)
+        core = slice(top, top + height), slice(left, left + width)
+        if not np.asarray(mask[core]).any():
+            out[core] = False
+            continue
+        state = _padded_state(mask, top, left, height, width, halo=halo)
+        if _thin(state, table, halo // 2, halo) >= halo // 2:
+            return False
+        inner = state[halo + 1 : halo + 1 + height, halo + 1 : halo + 1 + width]
+        out[core] = inner & _SET
     return True
 
 
-def _shape_of(mask: NDArray[Any]) -> tuple[int, int]:
-    if np.ndim(mask) != 2:
+def _shape_of(mask: NDArray[Any] | Blocks) -> tuple[int, int]:
+    if not isinstance(mask, Blocks) and np.ndim(mask) != 2:
         raise InputError(f"the mask has {np.ndim(mask)} dimensions", fix="pass an array of shape (rows, cols)")
-    rows, cols = np.shape(mask)
+    rows, cols = mask.shape if isinstance(mask, Blocks) else np.shape(mask)
     return rows, cols
 
 
-def _padded_state(mask: NDArray[Any], top: int, left: int, rows: int, cols: int, *, halo: int) -> NDArray[np.uint8]:
+def _padded_state(
+    mask: NDArray[Any] | Blocks, top: int, left: int, rows: int, cols: int, *, halo: int
+) -> NDArray[np.uint8]:
     """Copy a window and its halo out of a mask, with one frame of background around it."""
     margin = halo + 1
     state = np.zeros((rows + 2 * margin, cols + 2 * margin), np.uint8)
