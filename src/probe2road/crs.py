@@ -19,6 +19,7 @@ from probe2road.errors import CRSError
 __all__ = [
     "WGS84",
     "crs_to_text",
+    "extent_in_degrees",
     "is_true_to_scale",
     "local_crs",
     "parse_crs",
@@ -217,6 +218,19 @@ def transform(x: ArrayLike, y: ArrayLike, source: CRS, target: CRS) -> tuple[Any
     if source == target:
         return x, y
     return Transformer.from_crs(source, target, always_xy=True).transform(x, y)
+
+
+def extent_in_degrees(bounds: tuple[float, float, float, float], crs: CRS) -> str:
+    """Say in degrees where a box (left, bottom, right, top) lies, for a message.
+
+    Examples
+    --------
+    >>> extent_in_degrees((446000, 4636000, 447000, 4637000), CRS.from_epsg(32616))
+    '-87.6508..-87.6386 E, 41.8731..41.8822 N'
+    """
+    left, bottom, right, top = bounds
+    lon, lat = transform(np.array([left, right, left, right]), np.array([bottom, bottom, top, top]), crs, WGS84)
+    return f"{min(lon):.4f}..{max(lon):.4f} E, {min(lat):.4f}..{max(lat):.4f} N"
 
 
 def turn_headings(heading: ArrayLike, x: ArrayLike, y: ArrayLike, source: CRS, target: CRS) -> NDArray[np.float64]:

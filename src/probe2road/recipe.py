@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, cast
 
 from probe2road.bounds import OneOf
+from probe2road.crs import extent_in_degrees
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
@@ -25,6 +27,9 @@ from probe2road.vectorize.lines import VectorizeOptions, vectorize
 from probe2road.vectorize.skeleton import METHODS, Method, skeletonize_windows
 
 __all__ = ["BuildOptions", "build"]
+
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,13 @@ def build(
     with open_workspace(workspace, fleet, options, weights=digest, segmentation=options.segmentation) as work:
         if (kept := work.read_graph(ROADS)) is not None:
             return kept
-        return work.finish(ROADS, _built(fleet, options, weights, work, report))
+        graph = work.finish(ROADS, _built(fleet, options, weights, work, report))
+    if graph.edges.empty:
+        logger.warning(
+            "no road is certain enough: the graph is empty (%d fixes of %d traces at %s)",
+            *(len(fleet.traces), fleet.n_traces, extent_in_degrees(fleet.bounds, fleet.crs)),
+        )
+    return graph
 
 
 def _built(

@@ -38,6 +38,7 @@ __all__ = ["app", "main"]
 
 logger = logging.getLogger("probe2road")
 
+_NOTHING = 3  # exit code: the work was done and the files are there, but there is nothing in them
 _VOLUME = ("-v", "--verbose", "-q", "--quiet")
 
 app = typer.Typer(
@@ -122,6 +123,8 @@ def build(
             write_graph(graph, path)
     if keep_intermediate:
         draw_stages(keep_intermediate, fleet, keep_intermediate / "stages.png")
+    if graph.edges.empty:
+        raise typer.Exit(_NOTHING)
 
 
 @app.command()
@@ -202,6 +205,8 @@ def match(
             with atomic_path(path) as temporary:
                 table.to_parquet(temporary, index=False)
             logger.info("wrote %d rows to %s", len(table), path)
+    if not matches.fixes["edge"].notna().any():
+        raise typer.Exit(_NOTHING)
 
 
 @app.command()
@@ -359,7 +364,7 @@ def train(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line; an error of ours is one message and exit code 2."""
+    """Run the command line; an error of ours is one message and exit code 2, a result with nothing in it code 3."""
     # How much to say is said to the program, but may stand anywhere.
     arguments = sorted(sys.argv[1:] if arguments is None else arguments, key=lambda word: word not in _VOLUME)
     try:

@@ -17,8 +17,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.bounds import OneOf, Positive
-from probe2road.crs import require_metric, require_same_crs
-from probe2road.fleet.contract import Fleet
+from probe2road.crs import extent_in_degrees, require_metric, require_same_crs
+from probe2road.fleet.contract import Fleet, stray_fixes
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import TURN_DTYPES
 from probe2road.matching.chains import Paths, match_over_routes
@@ -26,7 +26,7 @@ from probe2road.matching.models import FLEET, SPARSE, PublishedModel, RouteModel
 from probe2road.matching.network import States, build_follow, build_states, edge_weight_array
 from probe2road.matching.observe import observe, sampling_interval, seconds
 from probe2road.matching.published import match_published
-from probe2road.matching.tables import fix_table, joined_paths, step_rows, step_table
+from probe2road.matching.tables import fix_table, joined_paths, step_rows, step_table, with_strays
 from probe2road.matching.viterbi import parameters
 from probe2road.notebook import figures_table
 from probe2road.options import checked
@@ -97,7 +97,8 @@ def match(
 
     Traces are matched one by one; their order does not matter. Ties go to the lower row of the edge table, then to
     the direction from u to v. A fix without an edge near, or in a stretch that fits no road, has no edge and a
-    reason. A graph without edges leaves every fix unmatched.
+    reason; so has one that nobody can have driven to and back from, and the path goes on past it. A graph without edges
+    leaves every fix unmatched.
 
     Parameters
     ----------
@@ -145,20 +146,38 @@ def match(
     require_same_crs(fleet.crs, graph.crs, where="match")
     states = build_states(graph, respect_oneway=options.respect_oneway)
     weight = edge_weight_array(graph, edge_weights)
-    profile = _profiles(fleet, options)
+    stray = stray_fixes(fleet)
+    driven = replace(fleet, traces=fleet.traces[~stray]) if stray.any() else fleet
+    profile = _profiles(driven, options)
     found = []
     for name in np.unique(profile):
         traces = np.flatnonzero(profile == name)
-        found.append((traces, _match_profile(_with_traces(fleet, traces), states, weight, str(name), options)))
-    paths = joined_paths(found, fleet.owner)
+        found.append((traces, _match_profile(_with_traces(driven, traces), states, weight, str(name), options)))
+    paths = with_strays(joined_paths(found, driven.owner), stray)
     radius = np.array([_radius(str(name), options) for name in profile])
-    matches = Matches(fix_table(graph, fleet, states, paths, radius), step_table(graph, fleet, states, paths))
+    matches = Matches(fix_table(graph, fleet, states, paths, radius, stray), step_table(graph, fleet, states, paths))
     logger.info(
         "matched %d of %d fixes of %d traces to %d of %d edges",
         int(matches.fixes["edge"].notna().sum()), len(matches.fixes), fleet.n_traces,
         matches.steps["edge"].nunique(), len(graph.edges),
     )  # fmt: skip
+    _warn_of_nothing(graph, fleet, matches)
     return matches
+
+
+def _warn_of_nothing(graph: RoadGraph, fleet: Fleet, matches: Matches) -> None:
+    """Warn where no fix is on the graph: as a rule the two are in different places, or in a wrong CRS."""
+    if len(fleet.traces) == 0 or matches.fixes["edge"].notna().any():
+        return
+    if graph.edges.empty:
+        logger.warning("no fix is matched: the graph has no edges")
+        return
+    logger.warning(
+        "no fix of %d is matched: the graph is at %s, the traces at %s",
+        len(fleet.traces),
+        extent_in_degrees(graph.bounds, graph.crs),
+        extent_in_degrees(fleet.bounds, fleet.crs),
+    )
 
 
 def turn_counts(matches: Matches, graph: RoadGraph) -> pd.DataFrame:

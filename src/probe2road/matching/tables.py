@@ -14,7 +14,7 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.chains import Paths
 from probe2road.matching.network import States
 
-__all__ = ["fix_table", "joined_paths", "step_rows", "step_table"]
+__all__ = ["fix_table", "joined_paths", "step_rows", "step_table", "with_strays"]
 
 
 def joined_paths(found: list[tuple[NDArray[np.int64], Paths]], owner: NDArray[np.int64]) -> Paths:
@@ -60,10 +60,37 @@ def joined_paths(found: list[tuple[NDArray[np.int64], Paths]], owner: NDArray[np
     )
 
 
+def with_strays(paths: Paths, stray: NDArray[np.bool_]) -> Paths:
+    """Put the fixes that were not looked at back into paths: they lie on no step, shape (fixes,)."""
+    if not stray.any():
+        return paths
+
+    def spread(values: NDArray[Any], nothing: Any) -> NDArray[Any]:
+        result = np.full(len(stray), nothing, values.dtype)
+        result[~stray] = values
+        return result
+
+    return paths._replace(
+        step=spread(paths.step, -1),
+        along=spread(paths.along, np.nan),
+        distance=spread(paths.distance, np.nan),
+        near=spread(paths.near, False),
+    )
+
+
 def fix_table(
-    graph: RoadGraph, fleet: Fleet, states: States, paths: Paths, radius: NDArray[np.float64]
+    graph: RoadGraph,
+    fleet: Fleet,
+    states: States,
+    paths: Paths,
+    radius: NDArray[np.float64],
+    stray: NDArray[np.bool_],
 ) -> pd.DataFrame:
-    """Write one row for each fix; ``radius`` (m), shape (traces,), is what its trace was searched within."""
+    """Write one row for each fix.
+
+    ``radius`` (m), shape (traces,), is what its trace was searched within; ``stray``, shape (fixes,), are those that
+    were not looked at.
+    """
     matched = paths.step >= 0
     state = np.zeros(len(matched), np.int64)
     state[matched] = paths.state[paths.step[matched]]
@@ -78,12 +105,14 @@ def fix_table(
             "offset": np.where(matched, paths.along, np.nan),
             "distance": np.where(matched, paths.distance, np.nan),
             "forward": pd.arrays.BooleanArray(state & 1 == 0, ~matched),
-            "reason": _reasons(fleet, states, paths, radius),
+            "reason": _reasons(fleet, states, paths, radius, stray),
         },
     )
 
 
-def _reasons(fleet: Fleet, states: States, paths: Paths, radius: NDArray[np.float64]) -> pd.Categorical:
+def _reasons(
+    fleet: Fleet, states: States, paths: Paths, radius: NDArray[np.float64], stray: NDArray[np.bool_]
+) -> pd.Categorical:
     """Say of every fix without an edge why, missing for the others."""
     names = [f"no edge within {value:g} m" for value in np.unique(radius)]
     fits_none, no_edges = len(names), len(names) + 1
@@ -91,8 +120,10 @@ def _reasons(fleet: Fleet, states: States, paths: Paths, radius: NDArray[np.floa
     code[paths.near] = fits_none
     if not len(states.length):
         code[:] = no_edges
+    code[stray] = no_edges + 1
     code[paths.step >= 0] = -1
-    return pd.Categorical.from_codes(code, [*names, "edges near, but none fits", "the graph has no edges"])
+    reasons = (*names, "edges near, but none fits", "the graph has no edges", "could not have been driven to")
+    return pd.Categorical.from_codes(code, reasons)
 
 
 def step_table(graph: RoadGraph, fleet: Fleet, states: States, paths: Paths) -> pd.DataFrame:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from probe2road.crs import require_same_crs
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
+from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks, without_strays
 from probe2road.raster.grid import Grid, Window, sparse_zeros
 
 __all__ = [
@@ -140,6 +140,7 @@ def rasterize_windows(
         The window and its counts, shape ``(3, rows + 2 halo, cols + 2 halo)``.
     """
     require_same_crs(fleet.crs, grid.crs, where="rasterize", what=("the traces are", "the grid is"))
+    fleet = without_strays(fleet, gaps)
     row, col = grid.rowcol(fleet.traces["x"], fleet.traces["y"])
     breaks = trace_breaks(fleet, gaps)
     point_row, point_col = grid.rowcol(fleet.points["x"], fleet.points["y"])

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
+from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks, without_strays
 from probe2road.raster.grid import Grid
 
 __all__ = ["estimate_bandwidth", "lateral_spread"]
@@ -80,6 +80,7 @@ def lateral_spread(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -
     >>> round(lateral_spread(fleet, fleet_grid(fleet)), 2)
     0.61
     """
+    fleet = without_strays(fleet, gaps)
     position, direction = _pieces(fleet, trace_breaks(fleet, gaps))
     cell_row, cell_col = (
         np.floor(np.abs(position[:, axis] - origin) / _CELL).astype(np.int64)

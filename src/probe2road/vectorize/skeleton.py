@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import logging
 from functools import cache
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, overload
 
 import numpy as np
 from numba import njit
@@ -80,6 +80,23 @@ def skeletonize(mask: NDArray[Any], *, method: Method = "guo_hall") -> NDArray[n
     skeleton = (state[1:-1, 1:-1] & _SET).astype(bool)
     logger.debug("thinned a mask of %d x %d pixels in %d iterations", *skeleton.shape, iterations)
     return skeleton
+
+
+@overload
+def skeletonize_windows(
+    mask: NDArray[Any],
+    out: NDArray[np.bool_] | None = None,
+    *,
+    window: int = 4096,
+    halo: int = 64,
+    method: Method = "guo_hall",
+) -> NDArray[np.bool_]: ...
+
+
+@overload
+def skeletonize_windows(
+    mask: Blocks, out: Blocks | None = None, *, window: int = 4096, halo: int = 64, method: Method = "guo_hall"
+) -> Blocks: ...
 
 
 def skeletonize_windows(

@@ -143,7 +143,7 @@ def _skeleton(
 ) -> NDArray[np.uint8]:
     """Thin the density of all trips."""
     if (kept := work.read_raster(SKELETON, grid)) is not None:
-        return kept
+        return kept[:, :]
     report("density", 0, 1)
     sigma, cut = (length / options.resolution for length in SIGMAS[options.sigma])
     closing = round(options.closing / options.resolution)

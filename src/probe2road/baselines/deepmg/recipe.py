@@ -137,7 +137,7 @@ def _segment(
     steps = thin_traces(fleet, trained.features, gaps=options.gaps)
     grid = fleet_grid(fleet, resolution=trained.features.resolution)
     if (kept := work.read_raster(PROBABILITY, grid)) is not None:
-        return kept, grid, steps
+        return kept[:, :], grid, steps
     probability = np.zeros(grid.shape, np.float32)
     for window, part in predict_windows(trained, steps, grid):
         report("segmentation", window.row, grid.rows)
