@@ -87,8 +87,14 @@ def impossible_fixes(traces: pd.DataFrame, crs: CRS, *, options: OutlierOptions 
         cuts = np.concatenate([[first], first + np.flatnonzero(jump[first:stop]), [stop]])
         size = np.diff(cuts)
         small = (size <= options.max_fixes) & (2 * size <= size.max())
+        main = np.flatnonzero(~small)
         for piece in np.flatnonzero(small):
-            bad[rows[cuts[piece] : cuts[piece + 1]]] = True
+            # Between a long piece and one at a wrong place, a short one can be at the right place.
+            before, after = main[main < piece][-1:], main[main > piece][:1]
+            ends = np.concatenate([cuts[before + 1] - 1, np.repeat(cuts[piece + 1] - 1, len(after))])
+            begins = np.concatenate([np.repeat(cuts[piece], len(before)), cuts[after]])
+            if _too_far(kept, crs, starts, ends, begins, options).all():
+                bad[rows[cuts[piece] : cuts[piece + 1]]] = True
     return bad
 
 
@@ -197,29 +203,43 @@ def _at_null_island(traces: pd.DataFrame, crs: CRS, options: OutlierOptions) -> 
 
 def _jumps(traces: pd.DataFrame, crs: CRS, starts: NDArray[np.int64], options: OutlierOptions) -> NDArray[np.bool_]:
     """Mark fixes that nobody can have driven to from the fix before."""
-    step = _steps(traces["x"].to_numpy(), traces["y"].to_numpy(), crs)
-    step[starts[:-1]] = 0.0
-    far = step > options.min_jump
+    x, y = (traces[axis].to_numpy() for axis in "xy")
+    far = np.zeros(len(x), bool)
+    far[1:] = _distance(x[:-1], y[:-1], x[1:], y[1:], crs) > options.min_jump
+    far[starts[:-1]] = False
     rows = np.flatnonzero(far)
-    if rows.size == 0:
-        return far
-    time = traces["t"].to_numpy(dtype="datetime64[ns]")
-    seconds = (time[rows] - time[rows - 1]) / np.timedelta64(1, "s")
-    with np.errstate(invalid="ignore"):
-        far[rows] = step[rows] > options.max_speed * np.maximum(seconds, 1.0)
-    for row in rows[np.isnan(seconds)]:
-        trace = np.searchsorted(starts, row, side="right") - 1
-        median = np.median(step[starts[trace] + 1 : starts[trace + 1]])
-        far[row] = step[row] > options.step_factor * median
+    far[rows] = _too_far(traces, crs, starts, rows - 1, rows, options)
     return far
 
 
-def _steps(x: NDArray[np.float64], y: NDArray[np.float64], crs: CRS) -> NDArray[np.float64]:
-    """Return the distance (m) from the row before; across the ball where the coordinates are degrees."""
+def _too_far(
+    traces: pd.DataFrame,
+    crs: CRS,
+    starts: NDArray[np.int64],
+    first: NDArray[np.int64],
+    second: NDArray[np.int64],
+    options: OutlierOptions,
+) -> NDArray[np.bool_]:
+    """Say whether nobody can have driven from some fixes to later ones of their traces."""
+    x, y = (traces[axis].to_numpy() for axis in "xy")
+    time = traces["t"].to_numpy(dtype="datetime64[ns]")
+    step = _distance(x[first], y[first], x[second], y[second], crs)
+    seconds = (time[second] - time[first]) / np.timedelta64(1, "s")
+    limit = options.max_speed * np.maximum(seconds, 1.0)
+    for place in np.flatnonzero(np.isnan(seconds)):
+        trace = np.searchsorted(starts, first[place], side="right") - 1
+        own = slice(starts[trace], starts[trace + 1])
+        steps = _distance(x[own][:-1], y[own][:-1], x[own][1:], y[own][1:], crs)
+        limit[place] = options.step_factor * float(np.median(steps))
+    return step > np.maximum(limit, options.min_jump)
+
+
+def _distance(
+    x: NDArray[np.float64], y: NDArray[np.float64], to_x: NDArray[np.float64], to_y: NDArray[np.float64], crs: CRS
+) -> NDArray[np.float64]:
+    """Return distances (m); across the ball where the coordinates are degrees."""
     if not crs.is_geographic:
-        return np.hypot(np.diff(x, prepend=x[:1]), np.diff(y, prepend=y[:1]))
-    lon, lat = np.radians(x), np.radians(y)
-    half_lat, half_lon = np.diff(lat, prepend=lat[:1]) / 2, np.diff(lon, prepend=lon[:1]) / 2
-    before = np.concatenate([lat[:1], lat[:-1]])
-    share = np.sin(half_lat) ** 2 + np.cos(lat) * np.cos(before) * np.sin(half_lon) ** 2
-    return 2.0 * _EARTH * np.arcsin(np.sqrt(np.clip(share, 0.0, 1.0)))
+        return np.hypot(to_x - x, to_y - y)
+    lon, lat, to_lon, to_lat = (np.radians(angle) for angle in (x, y, to_x, to_y))
+    share = np.sin((to_lat - lat) / 2) ** 2 + np.cos(lat) * np.cos(to_lat) * np.sin((to_lon - lon) / 2) ** 2
+    return np.asarray(2.0 * _EARTH * np.arcsin(np.sqrt(np.clip(share, 0.0, 1.0))))
