@@ -226,7 +226,7 @@ def extent_in_degrees(bounds: tuple[float, float, float, float], crs: CRS) -> st
     Examples
     --------
     >>> extent_in_degrees((446000, 4636000, 447000, 4637000), CRS.from_epsg(32616))
-    '-87.6508..-87.6386 E, 41.8731..41.8822 N'
+    '-87.6508..-87.6387 E, 41.8741..41.8832 N'
     """
     left, bottom, right, top = bounds
     lon, lat = transform(np.array([left, right, left, right]), np.array([bottom, bottom, top, top]), crs, WGS84)

@@ -374,3 +374,22 @@ def test_a_real_track_follows_its_true_route(interval: int) -> None:
     wrong = set(true) ^ set(found.steps["edge"])
     length = graph.edges["length"]
     assert length[list(wrong)].sum() < 0.02 * length[true].sum()
+
+
+def test_a_stray_fix_is_left_out_and_its_passage_stays_one() -> None:
+    graph = graph_from_lines([[(0, 0), (500, 0)]], crs="EPSG:32616")
+    table = pd.DataFrame({"trace_id": 1, "t": [*range(10), 10.4, *range(12, 20)], "y": 1.0})
+    table["x"] = 20.0 * table["t"]
+    straight = match(graph, fleet_from_tables(table.drop(index=10), crs="EPSG:32616", keep_crs=True))
+    table.loc[10, "y"] = 320.0
+    found = match(graph, fleet_from_tables(table, crs="EPSG:32616", keep_crs=True))
+    assert found.steps[["edge", "part"]].values.tolist() == [[0, 0]]
+    assert found.fixes["reason"].dropna().to_dict() == {10: "could not have been driven to"}
+    pd.testing.assert_frame_equal(found.fixes.drop(index=10).reset_index(drop=True), straight.fixes)
+
+
+def test_a_graph_elsewhere_is_told_with_both_extents(caplog: pytest.LogCaptureFixture) -> None:
+    graph = graph_from_lines([[(446000, 4636000), (446500, 4636000)]], crs="EPSG:32616")
+    table = pd.DataFrame({"trace_id": 1, "t": range(9), "x": 446000.0 + 10 * np.arange(9), "y": 4736000.0})
+    match(graph, fleet_from_tables(table, crs="EPSG:32616"))
+    assert "no fix of 9 is matched: the graph is at -87.65" in caplog.text
