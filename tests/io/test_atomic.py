@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import contextlib
+import itertools
 from pathlib import Path
 
 import pytest
 
 from probe2road.errors import OutputError
-from probe2road.io.atomic import atomic_path
+from probe2road.io.atomic import atomic_path, atomic_paths, settled
 
 
 def names(folder: Path) -> list[str]:
@@ -67,3 +69,64 @@ def test_a_missing_parent_is_named(tmp_path: Path) -> None:
         atomic_path(tmp_path / "absent" / "roads.gpkg"),
     ):
         pass
+
+
+def write_pair(folder: Path, text: str) -> None:
+    with atomic_paths([folder / "roads.csv", folder / "turns.csv"]) as places:
+        for place in places:
+            place.write_text(text)
+
+
+def killed_at_move(folder: Path, number: int, text: str, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Stop as a kill would, in the place of one of the renames; whether there are so many."""
+    count = itertools.count()
+    real = Path.replace
+
+    def replace(path: Path, target: Path) -> Path:
+        if next(count) == number:
+            raise KeyboardInterrupt
+        return real(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", replace)
+        patch.setattr("shutil.rmtree", lambda *words, **options: None)
+        with contextlib.suppress(KeyboardInterrupt):
+            write_pair(folder, text)
+            return False
+    return True
+
+
+def test_files_that_belong_together_are_all_old_or_all_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    for number in range(5):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        write_pair(folder, "old")
+        if not killed_at_move(folder, number, "new", monkeypatch):
+            break
+        texts = {settled(folder / name).read_text() for name in ("roads.csv", "turns.csv")}
+        assert len(texts) == 1
+        assert not list(folder.glob(".*.p2r-commit"))
+        seen += texts
+    assert seen == ["old", "new", "new"]
+
+
+def test_a_folder_that_takes_no_changes_is_read_as_it_was_committed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_pair(tmp_path, "old")
+    assert killed_at_move(tmp_path, 2, "new", monkeypatch)
+
+    def refuse(path: Path, target: Path) -> Path:
+        raise PermissionError(path)
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    assert {settled(tmp_path / name).read_text() for name in ("roads.csv", "turns.csv")} == {"new"}
+    assert (tmp_path / "turns.csv").read_text() == "old"
+
+
+def test_a_sibling_that_is_not_written_is_gone_with_the_old_files(tmp_path: Path) -> None:
+    write_pair(tmp_path, "old")
+    with atomic_paths([tmp_path / "roads.csv", tmp_path / "turns.csv"]) as (roads, _):
+        roads.write_text("new")
+    assert names(tmp_path) == ["roads.csv"]

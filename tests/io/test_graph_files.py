@@ -223,5 +223,14 @@ def test_siblings_of_another_graph_are_noticed(tee: RoadGraph, tmp_path: Path) -
     write_graph(tee, tmp_path / "roads.parquet")
     write_graph(graph_from_lines([[(0, 0), (1, 0)]], crs="EPSG:32616"), tmp_path / "other.parquet")
     (tmp_path / "other.nodes.parquet").replace(tmp_path / "roads.nodes.parquet")
-    with pytest.raises(InputError, match="ends at a node that does not exist"):
+    with pytest.raises(InputError, match=r"roads\.nodes\.parquet, is of another graph; take both from one run"):
         read_graph(tmp_path / "roads.parquet")
+
+
+def test_siblings_of_one_graph_share_a_mark_that_its_content_decides(tee: RoadGraph, tmp_path: Path) -> None:
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        write_graph(tee, tmp_path / folder / "roads.parquet")
+    for file in (tmp_path / "one").iterdir():
+        assert file.read_bytes() == (tmp_path / "two" / file.name).read_bytes()
+    assert len({pd.read_parquet(file).attrs["probe2road_graph"] for file in (tmp_path / "one").iterdir()}) == 1

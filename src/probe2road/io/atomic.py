@@ -3,27 +3,33 @@
 What is being written lies in a hidden folder beside its target, ``.NAME.HOST-PROCESS-RANDOM.p2r-part``. A process
 that is killed leaves that folder behind; the name says whose it was, so that the next write of the same target can
 tell a leftover from the work of a process that is still alive.
+
+Files that belong together change together. Their folder is renamed to ``.NAME.p2r-commit`` when all of them are
+complete, and from that moment on they are the files that count: they are moved into place, and whoever reads or writes
+there next does what a killed process could not. `settled` says where a file is to be read.
 """
 
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import shutil
 import socket
 import tempfile
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 
 from probe2road.errors import OutputError, Probe2RoadError
 
-__all__ = ["atomic_path", "is_workshop", "make_folder", "sweep_leftovers"]
+__all__ = ["atomic_path", "atomic_paths", "is_workshop", "make_folder", "require_place", "settled", "sweep_leftovers"]
 
-_PART = ".p2r-part"
+_PART, _COMMIT = ".p2r-part", ".p2r-commit"
+_CONTENT = "content.json"  # in a commit: the files that belong together, and which of them are no more
 _OWNER = re.compile(r"\.(?P<host>[0-9a-f]{8})-(?P<process>\d+)-[^.]*\.p2r-part$")
 _HOST = f"{zlib.crc32(socket.gethostname().encode()):08x}"
 _NO_ROOM = {
@@ -78,19 +84,134 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     ['notes.txt']
     """
     target = Path(path)
+    with _workshop(target) as workshop:
+        yield workshop / target.name
+        _move(workshop, target)
+
+
+@contextmanager
+def atomic_paths(paths: Sequence[str | PathLike[str]]) -> Iterator[list[Path]]:
+    """Give places to write files to that belong together: all of them become ``paths`` when the block ends, or none.
+
+    Only the first has to be written; where another is not, what was there before is removed. If the block raises, or
+    the process is killed before the last file is complete, all stay as they were. A process that is killed later
+    leaves the rest of the moves to the next one that asks for the files with `settled`, or writes beside them.
+
+    Parameters
+    ----------
+    paths
+        Files in one folder, which must exist.
+
+    Yields
+    ------
+    list of Path
+        Where to write each of them.
+
+    Raises
+    ------
+    OutputError
+        As for `atomic_path`.
+
+    Examples
+    --------
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> with atomic_paths([folder / "roads.csv", folder / "turns.csv"]) as (roads, turns):
+    ...     _ = roads.write_text("edge"), turns.write_text("from_edge")
+    >>> with atomic_paths([folder / "roads.csv", folder / "turns.csv"]) as (roads, _):
+    ...     _ = roads.write_text("edge,length")
+    >>> [file.name for file in folder.iterdir()]
+    ['roads.csv']
+    """
+    targets = [Path(path) for path in paths]
+    first = targets[0]
+    with _workshop(first) as workshop:
+        places = [workshop / target.name for target in targets]
+        yield places
+        if not places[0].exists():
+            raise OutputError("nothing was written", where=first)
+        for target in targets:
+            if target.is_dir():
+                raise OutputError("is a folder, and a file would replace it", where=target, fix="choose another name")
+        content = {"files": [target.name for target in targets]}
+        content["removed"] = [place.name for place in places if not place.exists()]
+        (workshop / _CONTENT).write_text(json.dumps(content), encoding="utf-8")
+        _make_durable(workshop)
+        commit = first.with_name(f".{first.name}{_COMMIT}")
+        _finish(commit)  # of another process, since ours began
+        workshop.replace(commit)
+        try:
+            _sync(first.parent)
+            _finish(commit)
+        except OSError as error:
+            fault = f"is complete, but cannot be moved into place ({error.strerror})"
+            fix = f"it lies in {commit.name}, and is moved when it is next read or written"
+            raise OutputError(fault, where=first, fix=fix) from error
+
+
+def settled(path: str | PathLike[str]) -> Path:
+    """Return where a file is to be read that `atomic_paths` may have written; ends what a killed process began.
+
+    That is the path itself, but for a folder that takes no changes, in which a process was killed as it moved files
+    into place.
+
+    Examples
+    --------
+    >>> settled("roads.parquet").name
+    'roads.parquet'
+    """
+    path = Path(path)
+    for commit in path.parent.glob(f".*{_COMMIT}"):
+        try:
+            _finish(commit)
+        except OSError:
+            content = _content_of(commit)
+            if path.name in content["removed"] or (commit / path.name).exists():
+                return commit / path.name
+    return path
+
+
+def _content_of(commit: Path) -> dict[str, list[str]]:
+    """Return what a commit says of itself; nothing where the folder is none of ours, or is gone by now."""
+    try:
+        content = json.loads((commit / _CONTENT).read_text(encoding="utf-8"))
+        return {"files": list(content["files"]), "removed": list(content["removed"])}
+    except (OSError, ValueError, LookupError, TypeError):
+        return {"files": [], "removed": []}
+
+
+def _finish(commit: Path) -> None:
+    """Move the files of a commit into place, as often as it takes: another process may do the same at this moment."""
+    content = _content_of(commit)
+    if not content["files"]:
+        return
+    for name in content["removed"]:
+        commit.with_name(name).unlink(missing_ok=True)
+    for name in content["files"]:
+        if (commit / name).exists():
+            with suppress(FileNotFoundError):
+                (commit / name).replace(commit.with_name(name))
+    _sync(commit.parent)
+    shutil.rmtree(commit, ignore_errors=True)
+
+
+@contextmanager
+def _workshop(target: Path) -> Iterator[Path]:
+    """Give a hidden folder beside a target that is gone when the block ends, and speak of a full disk as such."""
     if not target.parent.is_dir():
         raise OutputError(f"folder {target.parent} does not exist", where=target, fix="create it first")
-    sweep_leftovers(target.parent, target.name)
     try:
+        sweep_leftovers(target.parent, target.name)
+        for commit in target.parent.glob(f".*{_COMMIT}"):
+            _finish(commit)
         workshop = Path(
             tempfile.mkdtemp(dir=target.parent, prefix=f".{target.name}.{_HOST}-{os.getpid()}-", suffix=_PART)
         )
     except OSError as error:
-        raise OutputError(f"folder {target.parent} cannot be written ({error.strerror})", where=target) from error
+        reason = _NO_ROOM.get(error.errno or 0, error.strerror)
+        raise OutputError(f"folder {target.parent} cannot be written ({reason})", where=target) from error
     _open_workshops.add(workshop)
     try:
-        yield workshop / target.name
-        _move(workshop, target)
+        yield workshop
     except Probe2RoadError:
         raise
     except Exception as error:
@@ -102,6 +223,36 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     finally:
         _open_workshops.discard(workshop)
         shutil.rmtree(workshop, ignore_errors=True)
+
+
+def require_place(path: str | PathLike[str], *, folder: bool = False) -> None:
+    """Refuse an output that cannot be written where it is to go, before the work for it is done.
+
+    Parameters
+    ----------
+    path
+        File or folder that will be written.
+    folder
+        Whether it will be a folder.
+
+    Raises
+    ------
+    OutputError
+        If the folder that it goes into does not exist, or if it is a folder where a file is written, or the reverse.
+
+    Examples
+    --------
+    >>> require_place(tempfile.mkdtemp())
+    Traceback (most recent call last):
+        ...
+    probe2road.errors.OutputError: ...: is a folder, and a file would replace it; choose another name
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise OutputError(f"folder {path.parent} does not exist", where=path, fix="create it first")
+    if path.exists() and path.is_dir() != folder:
+        kinds = ("a file", "a folder") if folder else ("a folder", "a file")
+        raise OutputError(f"is {kinds[0]}, and {kinds[1]} would replace it", where=path, fix="choose another name")
 
 
 def _refusal_of_disk(folder: Path) -> str | None:

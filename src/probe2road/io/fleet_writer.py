@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from probe2road.errors import OutputError
 from probe2road.fleet.contract import Fleet
-from probe2road.io.atomic import atomic_path
+from probe2road.io.atomic import atomic_paths
 from probe2road.io.sources import FORMATS, POINTS_MARK
 
 __all__ = ["ROW_GROUP", "bounding_box", "point_table", "points_path", "with_geo", "write_fleet"]
@@ -52,7 +52,7 @@ def write_fleet(fleet: Fleet, path: str | PathLike[str]) -> list[Path]:
         The fleet.
     path
         File for the traces, with suffix ``.parquet``, ``.pq`` or ``.geoparquet``; the points go to
-        `points_path` of it. Each file is complete or absent.
+        `points_path` of it. Both become those of this fleet together, or not at all.
 
     Returns
     -------
@@ -79,13 +79,10 @@ def write_fleet(fleet: Fleet, path: str | PathLike[str]) -> list[Path]:
     if FORMATS.get(path.suffix.lower()) != "parquet":
         raise OutputError(f"the suffix {path.suffix!r} is not supported", where=path, fix="use .parquet")
     beside = points_path(path)
-    _write_table(fleet.traces, fleet.crs.to_json_dict(), path)
-    written = [path]
-    if len(fleet.points):
-        _write_table(fleet.points, fleet.crs.to_json_dict(), beside)
-        written.append(beside)
-    else:
-        beside.unlink(missing_ok=True)
+    written = [path, beside] if len(fleet.points) else [path]
+    with atomic_paths([path, beside]) as places:
+        for table, place in zip((fleet.traces, fleet.points), places[: len(written)], strict=False):
+            _write_table(table, fleet.crs.to_json_dict(), place)
     logger.info("wrote %d fixes and %d semantic points to %s", len(fleet.traces), len(fleet.points), path)
     return written
 
@@ -121,5 +118,4 @@ def _write_table(table: pd.DataFrame, crs: Mapping[str, Any], path: Path) -> Non
     """Write one table with its positions as a column of native points."""
     columns = point_table(table, "xyz" if np.isfinite(table["z"].to_numpy()).any() else "xy")
     columns = columns.replace_schema_metadata(with_geo(columns.schema, crs, bounding_box(table)).metadata)
-    with atomic_path(path) as temporary:
-        pq.write_table(columns, temporary, compression="zstd", row_group_size=ROW_GROUP)
+    pq.write_table(columns, path, compression="zstd", row_group_size=ROW_GROUP)

@@ -13,6 +13,7 @@ from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldE
 from probe2road.errors import InputError, MissingFileError, OptionError, OutputError
 from probe2road.graph.check import require_sound
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.io.atomic import settled
 from probe2road.io.formats import GraphFormat, adjusted
 from probe2road.io.graph_networkx import read_graphml, write_graphml
 from probe2road.io.graph_readers import read_parquet_graph, read_vector_graph
@@ -106,9 +107,10 @@ def read_graph(
     """
     format = adjusted(format or GraphFormat(), crs=crs, target_crs=target_crs, layer=layer)
     kind = graph_format(path, READABLE)
-    if not Path(path).is_file():
+    file = settled(path)
+    if not file.is_file():
         raise MissingFileError("no such file", where=path, fix="check the path")
-    if Path(path).stat().st_size == 0:
+    if file.stat().st_size == 0:
         raise InputError("the file is empty", where=path, fix="check that it is complete")
     if kind == "OSM":
         return read_osm(path, target_crs=format.target_crs)

@@ -25,8 +25,9 @@ from probe2road.crs import WGS84, local_crs, parse_crs, require_metric
 from probe2road.errors import CRSError, InputError
 from probe2road.graph.direction import in_driving_direction
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.io.atomic import settled
 from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table
-from probe2road.io.graph_writers import parquet_siblings
+from probe2road.io.graph_writers import GRAPH_MARK, parquet_siblings
 
 __all__ = ["graph_from_table", "read_note", "read_parquet_graph", "read_vector_graph"]
 
@@ -95,8 +96,9 @@ def read_parquet_graph(path: str | PathLike[str], *, crs: Any = None, target_crs
     """
     path = Path(path)
     nodes_path, turns_path = parquet_siblings(path)
+    nodes_path, turns_path = settled(nodes_path), settled(turns_path)
     try:
-        table = gpd.read_parquet(path)
+        table = gpd.read_parquet(settled(path))
         own = set(OWN_COLUMNS) <= set(table)
         nodes = gpd.read_parquet(nodes_path) if own and nodes_path.is_file() else None
         turns = pd.read_parquet(turns_path) if own and turns_path.is_file() else None
@@ -104,6 +106,12 @@ def read_parquet_graph(path: str | PathLike[str], *, crs: Any = None, target_crs
         raise InputError(
             f"cannot be read as GeoParquet ({_first_line(error)})", where=path, fix="check that it is complete"
         ) from error
+    mark = table.attrs.pop(GRAPH_MARK, None)
+    for beside, sibling in ((nodes_path, nodes), (turns_path, turns)):
+        other = None if sibling is None else sibling.attrs.pop(GRAPH_MARK, None)
+        if None not in (mark, other) and mark != other:
+            fix = "take both from one run, or remove the file beside the edges"
+            raise InputError(f"the file beside it, {beside.name}, is of another graph", where=path, fix=fix)
     return graph_from_table(table, nodes=nodes, turns=turns, crs=crs, target_crs=target_crs, where=path)
 
 

@@ -17,9 +17,10 @@ With turns as text, an edge carries ``to_edge@via_node:count`` for every turn th
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -33,10 +34,11 @@ import shapely
 from probe2road.crs import WGS84, crs_to_text, transform
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import edges_with_turns
-from probe2road.io.atomic import atomic_path
+from probe2road.io.atomic import atomic_path, atomic_paths
 from probe2road.io.graph_tables import outgoing
 
 __all__ = [
+    "GRAPH_MARK",
     "geojson_features",
     "parquet_siblings",
     "write_flatgeobuf",
@@ -47,6 +49,7 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
+GRAPH_MARK = "probe2road_graph"  # attribute of the tables of one graph: a digest of all of them
 GEOJSON_DECIMALS = 8  # of a degree: 1 mm
 
 
@@ -79,21 +82,40 @@ def write_geopackage(graph: RoadGraph, path: str | PathLike[str], *, note: Mappi
 def write_geoparquet(graph: RoadGraph, path: str | PathLike[str]) -> None:
     """Write the edges as GeoParquet 1.1 with a covering bounding box, nodes and turns in files beside it.
 
+    The three files become those of the new graph together, or not at all.
+
     Raises
     ------
     OutputError
         If a file cannot be written or the graph holds private columns.
     """
     graph = outgoing(graph, where=path)
-    nodes_path, turns_path = parquet_siblings(path)
-    # The edges come last: where they are new, so is everything beside them.
-    with atomic_path(turns_path) as temporary:
-        graph.turns.to_parquet(temporary, index=False, compression="zstd")
-    for table, target in ((graph.nodes, nodes_path), (graph.edges, path)):
-        with atomic_path(target) as temporary:
-            table.reset_index().to_parquet(
-                temporary, index=False, compression="zstd", schema_version="1.1.0", write_covering_bbox=True
+    tables = (graph.edges.reset_index(), graph.nodes.reset_index(), graph.turns.copy())
+    mark = _digest(tables)
+    # Each says which graph it is of: files can be copied one by one.
+    for table in tables:
+        table.attrs = {GRAPH_MARK: mark}
+    edges, nodes, turns = tables
+    with atomic_paths([path, *parquet_siblings(path)]) as (edges_place, nodes_place, turns_place):
+        for table, place in ((edges, edges_place), (nodes, nodes_place)):
+            table.to_parquet(
+                place, index=False, compression="zstd", schema_version="1.1.0", write_covering_bbox=True
             )
+        turns.to_parquet(turns_place, index=False, compression="zstd")
+
+
+def _digest(tables: Sequence[pd.DataFrame]) -> str:
+    """Return a digest of all that is in some tables; equal tables share it."""
+    digest = hashlib.blake2b(digest_size=16)
+    for table in tables:
+        digest.update(json.dumps([str(name) for name in table]).encode())
+        for name in table:
+            if name == "geometry":
+                lines = shapely.to_wkb(table[name].to_numpy())
+                digest.update(b"".join(lines))
+            else:
+                digest.update(table[name].to_csv(index=False).encode())
+    return digest.hexdigest()
 
 
 def parquet_siblings(path: str | PathLike[str]) -> tuple[Path, Path]:

@@ -12,6 +12,7 @@ from pyproj import CRS
 
 from probe2road.errors import InputError, MissingFileError
 from probe2road.fleet.tables import TableOrigin
+from probe2road.io.atomic import settled
 
 __all__ = ["FORMATS", "POINTS_MARK", "RawTable", "SourceFile", "find_sources"]
 
@@ -92,7 +93,7 @@ def find_sources(
             if not files:
                 raise InputError("the folder holds no supported file", where=item, fix=_supported())
         else:
-            files.setdefault(_existing(item), _stem(Path(item.name)))
+            files.setdefault(_existing(settled(item)), _stem(Path(item.name)))
     if len(set(files.values())) < len(files):  # files of one name: call them by their whole paths
         files = {path: path.as_posix() for path in files}
     return [SourceFile(path, FORMATS[_suffix(path)], name) for path, name in files.items()], left_out
@@ -112,6 +113,8 @@ def _existing(path: Path) -> Path:
 def _supported_files(folder: Path) -> list[Path]:
     """List the supported files in a folder and below, without hidden ones."""
     hidden = (".", "_")
+    for place in {path.parent for path in folder.rglob(".*") if path.is_dir()}:
+        settled(place / "any")  # ends what a killed process began
     inside = (path for path in folder.rglob("*") if path.is_file() and _suffix(path) in FORMATS)
     seen = (path for path in inside if not any(part.startswith(hidden) for part in path.relative_to(folder).parts))
     return [_existing(path) for path in sorted(seen)]
