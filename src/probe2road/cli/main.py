@@ -39,6 +39,7 @@ __all__ = ["app", "main"]
 logger = logging.getLogger("probe2road")
 
 _NOTHING = 3  # exit code: the work was done and the files are there, but there is nothing in them
+_TABLES = ".csv, .parquet, or with places .geoparquet, .gpkg, .geojson"
 _VOLUME = ("-v", "--verbose", "-q", "--quiet")
 
 app = typer.Typer(
@@ -102,10 +103,10 @@ def build(
     from probe2road.recipe import build as build_graph
     from probe2road.run.workspace import resumable
 
+    _require_places(*output)
     for path in output:
         graph_format(path)
-        if not path.parent.is_dir():
-            raise OutputError(f"folder {path.parent} does not exist", where=path, fix="create it first")
+    _require_folders(keep_intermediate)
     table = read_toml(config) if config else {}
     format = chosen_format(fleet_format, table, where=config)
     options = options_from_table(table, BuildOptions, where=config)
@@ -149,10 +150,13 @@ def align(
     from probe2road.alignment.align import align as align_fleet
     from probe2road.alignment.report import draw_alignment, write_report
     from probe2road.io.fleet_reader import read_fleet, read_fleet_files
-    from probe2road.io.fleet_writer import write_fleet
+    from probe2road.io.fleet_writer import require_fleet_suffix, write_fleet
     from probe2road.options import options_from_table, read_toml
     from probe2road.run.workspace import resumable
 
+    _require_places(output)
+    require_fleet_suffix(output)
+    _require_folders(report)
     table = read_toml(config) if config else {}
     format = chosen_format(fleet_format, table, where=config)
     options = options_from_table(table, AlignOptions, where=config)
@@ -177,34 +181,53 @@ def align(
 def match(
     traces: Annotated[Path, typer.Argument(help="Fleet data: a file or a folder.")],
     graph: Annotated[Path, typer.Argument(help="Road graph, in any format that build writes, or OSM.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file for the matches, a row for each fix.")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="File for the matches, a row for each fix; the suffix decides: " + _TABLES),
+    ],
     *,
-    steps: Annotated[Path | None, typer.Option(help="Parquet file for the paths, a row for each edge driven.")] = None,
+    steps: Annotated[Path | None, typer.Option(help="File for the paths, a row for each edge driven.")] = None,
+    trips: Annotated[Path | None, typer.Option(help="File for the lines driven, a row for each trip.")] = None,
+    roads: Annotated[Path | None, typer.Option(help="Graph to write, whose edges the matches name.")] = None,
     profile: Annotated[str | None, typer.Option(help="auto, fleet, sparse or published.")] = None,
     fleet_format: Said[FleetFormat],
     graph_format: Said[GraphFormat],
     config: Annotated[Path | None, typer.Option(help="TOML file with matching options, and how to read.")] = None,
 ) -> None:
     """Match traces to the edges of a road graph."""
-    from probe2road.io.atomic import atomic_path
     from probe2road.io.fleet_reader import read_fleet
+    from probe2road.io.graph_files import graph_format as format_of_graph
+    from probe2road.io.graph_files import write_graph
+    from probe2road.io.table_writer import GEO_SUFFIXES, require_table_suffix, write_table
     from probe2road.matching.match import MatchOptions
     from probe2road.matching.match import match as match_fleet
+    from probe2road.matching.places import matched_edges, matched_points, trip_lines
     from probe2road.options import options_from_table, read_toml
 
+    _require_places(output, steps, trips, roads)
+    for path in (output, steps, trips):
+        if path is not None:
+            require_table_suffix(path)
+    if roads is not None:
+        format_of_graph(roads)
     table = read_toml(config) if config else {}
     format = chosen_format(fleet_format, table, where=config)
     roads_format = chosen_format(graph_format, table, where=config)
     options = options_from_table(table, MatchOptions, where=config)
     options = replace(options, profile=profile) if profile else options
-    roads = read_roads(graph, graph_format, format=roads_format, target_crs=format.target_crs)
-    fleet = read_fleet(traces, format=format, target_crs=roads.crs)
-    matches = match_fleet(roads, fleet, options=options)
-    for path, table in ((output, matches.fixes), (steps, matches.steps)):
-        if path is not None:
-            with atomic_path(path) as temporary:
-                table.to_parquet(temporary, index=False)
-            logger.info("wrote %d rows to %s", len(table), path)
+    network = read_roads(graph, graph_format, format=roads_format, target_crs=format.target_crs)
+    fleet = read_fleet(traces, format=format, target_crs=network.crs)
+    matches = match_fleet(network, fleet, options=options)
+    placed = output.suffix.lower() in GEO_SUFFIXES
+    write_table(matched_points(matches, network) if placed else matches.fixes, output, layer="matches")
+    if steps is not None:
+        driven = matched_edges(matches, network)
+        placed = steps.suffix.lower() in GEO_SUFFIXES
+        write_table(driven if placed else driven.drop(columns="geometry"), steps, layer="steps")
+    if trips is not None:
+        write_table(trip_lines(matches, network), trips, layer="trips")
+    if roads is not None:
+        write_graph(network, roads)
     if not matches.fixes["edge"].notna().any():
         raise typer.Exit(_NOTHING)
 
@@ -221,20 +244,24 @@ def evaluate(
         str | None, typer.Option(help="Comma-separated: geo, itopo, topo, apls, buffer_geo, ...")
     ] = None,
     area: Annotated[str | None, typer.Option(help="Clip both to left,bottom,right,top in the reference's CRS.")] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="CSV file for the scores.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File for the scores; the suffix decides: .csv or .parquet.")
+    ] = None,
 ) -> None:
     """Score a road graph against a reference; both may be in any format that build writes, or OSM."""
-    from probe2road.io.atomic import atomic_path
+    from probe2road.io.table_writer import require_table_suffix, write_table
     from probe2road.metrics import DEFAULT_METRICS
     from probe2road.metrics import evaluate as score
 
+    if output:
+        _require_places(output)
+        require_table_suffix(output, (".csv", ".parquet"))
     target = read_roads(reference, reference_format)
     names = metrics.split(",") if metrics else DEFAULT_METRICS
     box = four_numbers(area, "--area") if area else None
     scores = score(read_roads(proposal, graph_format), target, metrics=names, area=box)
     if output:
-        with atomic_path(output) as temporary:
-            scores.to_csv(temporary, index=False)
+        write_table(scores, output)
     _print_scores(scores)
 
 
@@ -273,6 +300,7 @@ def view(
     from probe2road.io.fleet_reader import read_fleet
 
     require_drawable(output)
+    _require_places(output)
     format = chosen_format(fleet_format)
     roads = read_roads(graph, graph_format, target_crs=format.target_crs)
     fleet = read_fleet(traces, points, format=format, target_crs=roads.crs) if traces else None
@@ -287,6 +315,7 @@ def demo(
     """Run the main job on a simulated cloverleaf, offline, and say which files to open."""
     from probe2road.demo import run_demo
 
+    _require_folders(folder)
     with progress_bar() as progress:
         files, scores = run_demo(folder, progress=progress)
     _print_scores(scores)
@@ -315,6 +344,7 @@ def simulate(
     from probe2road.simulation.networks.osm import read_network
     from probe2road.simulation.presets import find_preset
 
+    _require_folders(output)
     if (drives is None) == (kilometres is None):
         raise OptionError("the amount must be given once", where="simulate", fix="pass --drives or --kilometres")
     chosen = find_preset(preset)
@@ -350,6 +380,7 @@ def train(
     from probe2road.training.loop import is_first, use_threads
     from probe2road.training.loop import train as run_training
 
+    _require_folders(output)
     chosen = load_config(config)
     if threads is not None:
         use_threads(threads)
@@ -377,6 +408,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         typer.secho("interrupted; start again to go on", err=True)
         sys.exit(130)
+
+
+def _require_places(*outputs: Path | None) -> None:
+    """Refuse files that cannot be written where they are to go, before any work, and two outputs of one name."""
+    from probe2road.io.atomic import require_place
+
+    named = [path for path in outputs if path is not None]
+    for path in named:
+        require_place(path)
+    for number, path in enumerate(named):
+        if path.absolute() in [other.absolute() for other in named[:number]]:
+            raise OptionError("is named twice as an output", where=path, fix="name a file for each")
+
+
+def _require_folders(*outputs: Path | None) -> None:
+    """Refuse a file where a folder is to go; one that is not there is created when it is written."""
+    for path in outputs:
+        if path is not None and path.exists() and not path.is_dir():
+            raise OutputError("is a file, and a folder would be written", where=path, fix="choose another name")
 
 
 def _network_choice(

@@ -19,7 +19,7 @@ from probe2road.fleet.contract import Fleet
 from probe2road.io.atomic import atomic_paths
 from probe2road.io.sources import FORMATS, POINTS_MARK
 
-__all__ = ["ROW_GROUP", "bounding_box", "point_table", "points_path", "with_geo", "write_fleet"]
+__all__ = ["ROW_GROUP", "bounding_box", "point_table", "points_path", "require_fleet_suffix", "with_geo", "write_fleet"]
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +36,19 @@ def points_path(path: str | PathLike[str]) -> Path:
     """
     path = Path(path)
     return path.with_name(f"{path.stem}.{POINTS_MARK}{path.suffix}")
+
+
+def require_fleet_suffix(path: str | PathLike[str]) -> None:
+    """Refuse a file name that `write_fleet` has no format for.
+
+    Raises
+    ------
+    OutputError
+        If the suffix is another than those of Parquet.
+    """
+    suffix = Path(path).suffix
+    if FORMATS.get(suffix.lower()) != "parquet":
+        raise OutputError(f"the suffix {suffix!r} is not supported", where=path, fix="use .parquet")
 
 
 def write_fleet(fleet: Fleet, path: str | PathLike[str]) -> list[Path]:
@@ -76,8 +89,7 @@ def write_fleet(fleet: Fleet, path: str | PathLike[str]) -> list[Path]:
     True
     """
     path = Path(path)
-    if FORMATS.get(path.suffix.lower()) != "parquet":
-        raise OutputError(f"the suffix {path.suffix!r} is not supported", where=path, fix="use .parquet")
+    require_fleet_suffix(path)
     beside = points_path(path)
     written = [path, beside] if len(fleet.points) else [path]
     with atomic_paths([path, beside]) as places:

@@ -98,9 +98,7 @@ def write_geoparquet(graph: RoadGraph, path: str | PathLike[str]) -> None:
     edges, nodes, turns = tables
     with atomic_paths([path, *parquet_siblings(path)]) as (edges_place, nodes_place, turns_place):
         for table, place in ((edges, edges_place), (nodes, nodes_place)):
-            table.to_parquet(
-                place, index=False, compression="zstd", schema_version="1.1.0", write_covering_bbox=True
-            )
+            table.to_parquet(place, index=False, compression="zstd", schema_version="1.1.0", write_covering_bbox=True)
         turns.to_parquet(turns_place, index=False, compression="zstd")
 
 
