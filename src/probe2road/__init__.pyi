@@ -38,6 +38,7 @@ from .graph.check import check_graph as check_graph
 from .graph.clean import CleanOptions as CleanOptions
 from .graph.clean import clean_graph as clean_graph
 from .graph.direction import DirectionOptions as DirectionOptions
+from .graph.disclosure import withhold as withhold
 from .graph.roadgraph import RoadGraph as RoadGraph
 from .graph.roadgraph import graph_from_lines as graph_from_lines
 from .io.describe import describe_fleet as describe_fleet

@@ -18,6 +18,7 @@ from probe2road.errors import CRSError
 
 __all__ = [
     "WGS84",
+    "crs_title",
     "crs_to_text",
     "extent_in_degrees",
     "is_true_to_scale",
@@ -303,3 +304,29 @@ def crs_to_text(crs: CRS) -> str:
     if authority is not None and CRS.from_authority(*authority) == crs:
         return ":".join(authority)
     return crs.to_json()
+
+
+def crs_title(crs: CRS) -> str:
+    """Return what a CRS is called, for people; one without a name is described.
+
+    Examples
+    --------
+    >>> crs_title(CRS("EPSG:32616"))
+    'WGS 84 / UTM zone 16N'
+    >>> crs_title(CRS("+proj=tmerc +lat_0=48 +lon_0=12.25 +ellps=WGS84"))
+    'Transverse Mercator around 48°, 12.25°'
+    """
+    name = crs.name.strip()
+    if name.lower() not in ("", "unknown", "unnamed", "undefined", "undefined crs"):
+        return name
+    operation = crs.coordinate_operation
+    if operation is None:
+        return "coordinate reference system without a name"
+    origin = {value.name: value.value for value in operation.params}
+    places = [
+        f"{value:g}°"
+        for word in ("Latitude of", "Longitude of")
+        for name, value in origin.items()
+        if name.startswith(word)
+    ]
+    return operation.method_name + (f" around {', '.join(places[:2])}" if places else "")

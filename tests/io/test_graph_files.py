@@ -16,7 +16,7 @@ import pytest
 import shapely
 
 from probe2road.crs import local_crs
-from probe2road.errors import CRSError, InputError
+from probe2road.errors import CRSError, InputError, OutputError
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.graph.tables import TURN_DTYPES
 from probe2road.io.graph_files import read_graph, write_graph
@@ -234,3 +234,18 @@ def test_siblings_of_one_graph_share_a_mark_that_its_content_decides(tee: RoadGr
     for file in (tmp_path / "one").iterdir():
         assert file.read_bytes() == (tmp_path / "two" / file.name).read_bytes()
     assert len({pd.read_parquet(file).attrs["probe2road_graph"] for file in (tmp_path / "one").iterdir()}) == 1
+
+
+PRIVATE = ["gps_time", "start_time", "track_id", "imei", "session", "plate", "driver", "session_id", "License Plate"]
+
+
+@pytest.mark.parametrize("name", PRIVATE)
+def test_private_columns_are_refused_by_name(tee: RoadGraph, tmp_path: Path, name: str) -> None:
+    with pytest.raises(OutputError, match="may identify drives"):
+        write_graph(replace(tee, edges=tee.edges.assign(**{name: "x"})), tmp_path / "roads.gpkg")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["name", "tracks", "vehicle_support", "speed", "maxspeed", "surface", "trips_near"])
+def test_other_columns_are_not(tee: RoadGraph, tmp_path: Path, name: str) -> None:
+    write_graph(replace(tee, edges=tee.edges.assign(**{name: "x"})), tmp_path / "roads.gpkg")

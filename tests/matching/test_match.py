@@ -383,7 +383,7 @@ def test_a_stray_fix_is_left_out_and_its_passage_stays_one() -> None:
     straight = match(graph, fleet_from_tables(table.drop(index=10), crs="EPSG:32616", keep_crs=True))
     table.loc[10, "y"] = 320.0
     found = match(graph, fleet_from_tables(table, crs="EPSG:32616", keep_crs=True))
-    assert found.steps[["edge", "part"]].values.tolist() == [[0, 0]]
+    assert found.steps[["edge", "part"]].to_numpy().tolist() == [[0, 0]]
     assert found.fixes["reason"].dropna().to_dict() == {10: "could not have been driven to"}
     pd.testing.assert_frame_equal(found.fixes.drop(index=10).reset_index(drop=True), straight.fixes)
 

@@ -86,6 +86,8 @@ def build(
     device: Annotated[str | None, typer.Option(help="Device of the network: cpu or cuda.")] = None,
     resolution: Annotated[float | None, typer.Option(help="Metres per pixel.")] = None,
     refine: Annotated[bool, typer.Option(help="Let the traces fill gaps and split false junctions.")] = True,
+    min_vehicles: Annotated[int, typer.Option(help="Vehicles that an edge needs to be written.")] = 1,
+    min_drives: Annotated[int, typer.Option(help="Drives that an edge needs to be written.")] = 1,
     config: Annotated[Path | None, typer.Option(help="TOML file with build options, and how to read.")] = None,
     keep_intermediate: Annotated[
         Path | None, typer.Option(help="Folder that keeps what every stage made, and a picture of it.")
@@ -96,6 +98,7 @@ def build(
     An interrupted run goes on where it stopped when it is started again.
     """
     from probe2road.draw.stages import draw_stages
+    from probe2road.graph.disclosure import withhold
     from probe2road.io.fleet_reader import read_fleet
     from probe2road.io.graph_files import graph_format, write_graph
     from probe2road.options import options_from_table, read_toml
@@ -120,6 +123,7 @@ def build(
     keeping = nullcontext(keep_intermediate) if keep_intermediate else resumable(output[0])
     with keeping as workspace, progress_bar() as progress:
         graph = build_graph(fleet, options=options, workspace=workspace, progress=progress)
+        graph = withhold(graph, min_vehicles=min_vehicles, min_drives=min_drives)
         for path in output:
             write_graph(graph, path)
     if keep_intermediate:
@@ -290,6 +294,7 @@ def view(
     points: Annotated[Path | None, typer.Option(help="Semantic points to show under it.")] = None,
     reference: Annotated[Path | None, typer.Option(help="Road graph to compare with; only in a PNG.")] = None,
     title: Annotated[str | None, typer.Option(help="Heading; the file's name without it.")] = None,
+    min_drives: Annotated[int, typer.Option(help="Drives that an edge, and a pixel of traces, needs.")] = 1,
     fleet_format: Said[FleetFormat],
     graph_format: Said[GraphFormat],
     reference_format: Said[GraphFormat],
@@ -305,7 +310,7 @@ def view(
     roads = read_roads(graph, graph_format, target_crs=format.target_crs)
     fleet = read_fleet(traces, points, format=format, target_crs=roads.crs) if traces else None
     compared = read_roads(reference, reference_format) if reference else None
-    draw(roads, output, fleet=fleet, reference=compared, title=title or graph.name)
+    draw(roads, output, fleet=fleet, reference=compared, title=title or graph.name, min_drives=min_drives)
 
 
 @app.command()

@@ -54,6 +54,10 @@ FLAGS: Mapping[str, str] = {
     "segmenter": "--segmenter",
     "resolution": "--resolution",
     "data": "--data",
+    "trim_ends": "--trim-ends",
+    "min_vehicles": "--min-vehicles",
+    "min_drives": "--min-drives",
+    "refine": "--refine",
 }
 
 # An argument in a message, name=literal, such as crs="EPSG:32616". A path starts a message or has a slash before it.
@@ -103,6 +107,9 @@ def fleet_options(
             "--no-header", help="Text tables have no line of names: columns are 0, 1, 2.", rich_help_panel=_FLEET
         ),
     ] = False,
+    trim_ends: Annotated[
+        float | None, typer.Option(help="Metres to leave out at both ends of every trace.", rich_help_panel=_FLEET)
+    ] = None,
 ) -> Said[FleetFormat]:
     """Return what is said of the files of a fleet."""
     from probe2road.io.formats import FleetFormat
@@ -115,6 +122,7 @@ def fleet_options(
         "bbox": four_numbers(bbox, "--bbox") if bbox else None,
         "delimiter": delimiter,
         "header": False if no_header else None,
+        "trim_ends": trim_ends,
     }
     return Said(FleetFormat, "format", fields, FLAGS)
 

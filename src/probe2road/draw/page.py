@@ -24,14 +24,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from probe2road.crs import WGS84, transform
+from probe2road.crs import WGS84, crs_title, transform
 from probe2road.errors import OptionError
 from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path
 from probe2road.io.graph_tables import outgoing
 from probe2road.io.graph_writers import geojson_features
-from probe2road.raster.counts import rasterize
+from probe2road.raster.counts import rasterize, without_rare
 from probe2road.raster.grid import Grid
 
 __all__ = ["page_text", "write_page"]
@@ -67,6 +67,7 @@ def write_page(
     title: str = "Road graph",
     color_by: str = "origin",
     resolution: float = 1.0,
+    min_drives: int = 1,
 ) -> None:
     """Write a road graph, and the fleet data it came from, as one HTML page to look at.
 
@@ -85,6 +86,8 @@ def write_page(
         Edge column to colour by at first; the page lets the reader choose among all that have values.
     resolution
         Metres per pixel of the densities; made coarser where the image would exceed 4096 pixels.
+    min_drives
+        Traces that a pixel needs to be drawn.
 
     Raises
     ------
@@ -104,7 +107,9 @@ def write_page(
     >>> "<h1>A &amp; B</h1>" in page.read_text()
     True
     """
-    page = page_text(graph, where=path, fleet=fleet, title=title, color_by=color_by, resolution=resolution)
+    page = page_text(
+        graph, where=path, fleet=fleet, title=title, color_by=color_by, resolution=resolution, min_drives=min_drives
+    )
     with atomic_path(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     logger.info("wrote a view of %d edges to %s (%.1f MB)", len(graph.edges), path, len(page) / 1e6)
@@ -118,6 +123,7 @@ def page_text(
     title: str = "Road graph",
     color_by: str = "origin",
     resolution: float = 1.0,
+    min_drives: int = 1,
 ) -> str:
     """Return the page as text; see `write_page`. Errors name ``where`` as the place it was meant for."""
     if not resolution > 0:
@@ -127,7 +133,7 @@ def page_text(
         "bounds": _bounds(graph, fleet),
         "edges": {"type": "FeatureCollection", "features": geojson_features(_edge_table(graph), decimals=_DECIMALS)},
         "nodes": {"type": "FeatureCollection", "features": _node_features(graph)},
-        "densities": [] if fleet is None or fleet.traces.empty else _densities(fleet, resolution),
+        "densities": [] if fleet is None or fleet.traces.empty else _densities(fleet, resolution, min_drives),
         "attributes": _attributes(graph.edges, color_by),
         "columns": _columns(graph.edges),
     }
@@ -156,7 +162,7 @@ def _summary(graph: RoadGraph, fleet: Fleet | None) -> str:
     parts = [f"{len(graph.edges):,} edges", f"{len(graph.nodes):,} nodes", f"{graph.length / 1000:,.1f} km"]
     if fleet is not None:
         parts.append(f"from {fleet.n_traces:,} traces")
-    return f"{', '.join(parts)}. {graph.crs.name}."
+    return f"{', '.join(parts)}. {crs_title(graph.crs)}."
 
 
 def _bounds(graph: RoadGraph, fleet: Fleet | None) -> list[float]:
@@ -261,7 +267,7 @@ def _rounded(limits: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.unique([round(float(limit), int(digit)) for limit, digit in zip(limits, digits, strict=True)])
 
 
-def _densities(fleet: Fleet, resolution: float) -> list[dict[str, Any]]:
+def _densities(fleet: Fleet, resolution: float, min_drives: int) -> list[dict[str, Any]]:
     """Count fleet data per pixel in Web Mercator; a close and a far image per channel that has anything."""
     left, bottom, right, top = fleet.bounds
     _, lat = transform([(left + right) / 2], [(bottom + top) / 2], fleet.crs, WGS84)
@@ -270,7 +276,7 @@ def _densities(fleet: Fleet, resolution: float) -> list[dict[str, Any]]:
     grid = _image_grid(mercator.bounds, resolution * stretch, _MARGIN * stretch)
     limits = TraceGaps()
     gaps = TraceGaps(max_step=limits.max_step * stretch, max_speed=limits.max_speed * stretch)
-    counts = rasterize(mercator, grid, gaps=gaps)
+    counts = without_rare(rasterize(mercator, grid, gaps=gaps), grid, least=min_drives)
     left, bottom, right, top = grid.bounds
     lon, lat = transform([left, right, right, left], [top, top, bottom, bottom], _WEB_MERCATOR, WGS84)
     corners = [[round(x, 9), round(y, 9)] for x, y in zip(lon, lat, strict=True)]

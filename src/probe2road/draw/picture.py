@@ -16,7 +16,7 @@ from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path
-from probe2road.raster.counts import rasterize
+from probe2road.raster.counts import rasterize, without_rare
 from probe2road.raster.grid import Grid
 
 if TYPE_CHECKING:
@@ -147,6 +147,7 @@ def draw_graph(
     bounds: Bounds | None = None,
     title: str = "",
     width: float = 10.0,
+    min_drives: int = 1,
 ) -> None:
     """Draw a graph over its traces, and over a reference graph where there is one.
 
@@ -166,6 +167,8 @@ def draw_graph(
         Heading.
     width
         Inches of the longer side.
+    min_drives
+        Traces that a pixel needs to be drawn.
 
     Raises
     ------
@@ -182,7 +185,8 @@ def draw_graph(
         left, bottom, right, top = area
         resolution = max(right - left, top - bottom) / (width * DPI)
         grid = Grid.from_bounds(area, resolution=resolution, crs=graph.crs)
-        _draw_array(axis, rasterize(fleet, grid)[0], grid, area)
+        counts = without_rare(rasterize(fleet, grid), grid, least=min_drives)
+        _draw_array(axis, counts[0], grid, area)
         handles.append(("#8a97a6", 1.5, "traces"))
     if reference is not None:
         _draw_lines(axis, reference.edges.geometry.to_numpy(), _REFERENCE_COLOR, 5.0, level=0)

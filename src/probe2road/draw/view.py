@@ -14,6 +14,7 @@ from probe2road.draw.page import page_text, write_page
 from probe2road.draw.picture import draw_graph
 from probe2road.errors import OptionError
 from probe2road.fleet.contract import Fleet
+from probe2road.graph.disclosure import withhold
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path
 from probe2road.notebook import in_notebook
@@ -90,6 +91,7 @@ def view(
     reference: RoadGraph | None = None,
     title: str | None = None,
     color_by: str | None = None,
+    min_drives: int = 1,
 ) -> None:
     """Draw a road graph over the fleet data that it came from: an HTML page, or a picture.
 
@@ -110,6 +112,9 @@ def view(
         Heading.
     color_by
         Edge column to colour by at first, where it is not the origin; only in a page.
+    min_drives
+        Leave out the edges with fewer drives, as `withhold` does, the pixels that fewer traces cross, and semantic
+        points away from all other pixels.
 
     Raises
     ------
@@ -134,14 +139,17 @@ def view(
     probe2road.errors.OptionError: ...roads.html: a page shows no reference; use .png
     """
     require_drawable(path)
+    graph = withhold(graph, min_drives=min_drives)
     if Path(path).suffix.lower() in _PICTURES:
         if color_by is not None:
             raise OptionError("a picture is coloured by origin only", where=path, fix="use .html")
-        draw_graph(graph, path, fleet=fleet, reference=reference, title=title or "")
+        draw_graph(graph, path, fleet=fleet, reference=reference, title=title or "", min_drives=min_drives)
         return
     if reference is not None:
         raise OptionError("a page shows no reference", where=path, fix="use .png")
-    write_page(graph, path, fleet=fleet, title=title or "Road graph", color_by=color_by or "origin")
+    write_page(
+        graph, path, fleet=fleet, title=title or "Road graph", color_by=color_by or "origin", min_drives=min_drives
+    )
 
 
 def explore(

@@ -15,6 +15,8 @@ from probe2road.crs import WGS84, same_crs
 from probe2road.errors import CRSError, InputError
 from probe2road.fleet.contract import Fleet, fleet_from_checked
 from probe2road.fleet.tables import check_points, check_traces
+from probe2road.fleet.trimming import trim_ends
+from probe2road.io.atomic import settled
 from probe2road.io.delimited import read_text_table
 from probe2road.io.fleet_writer import points_path
 from probe2road.io.formats import BBox, ColumnMap, FleetFormat, adjusted
@@ -137,7 +139,7 @@ def read_fleet(
         "read %d fixes of %d traces and %d semantic points from %s (%s)",
         *(len(fleet.traces), fleet.n_traces, len(fleet.points), where, told),
     )
-    return fleet
+    return trim_ends(fleet, format.trim_ends)
 
 
 def read_fleet_files(path: str | PathLike[str]) -> Fleet:
@@ -159,7 +161,7 @@ def read_fleet_files(path: str | PathLike[str]) -> Fleet:
     >>> fleet.n_traces, len(fleet.points) > 0
     (2, True)
     """
-    points = points_path(path)
+    points = settled(points_path(path))
     return read_fleet(path, points if points.exists() else None)
 
 

@@ -30,7 +30,7 @@ class FleetFormat:
     Raises
     ------
     OptionError
-        If ``bbox`` is no box, or ``delimiter`` not one character.
+        If ``bbox`` is no box, ``delimiter`` not one character, or ``trim_ends`` negative.
     CRSError
         If pyproj cannot read a CRS.
 
@@ -53,12 +53,16 @@ class FleetFormat:
     header: bool = True  # whether text tables start with a line of names; else the columns are 0, 1, 2
     outliers: OutlierOptions = field(default_factory=OutlierOptions)  # what no vehicle can have been at is left out
 
+    trim_ends: float = 0.0  # m left out at both ends of every trace, in which somebody may live
+
     def __post_init__(self) -> None:
         """Refuse what is no box, no delimiter or no CRS."""
         if self.bbox is not None:
             object.__setattr__(self, "bbox", _checked_bbox(self.bbox))  # four floats, whatever sequence they came in
         if self.delimiter is not None and len(self.delimiter) != 1:
             raise OptionError(f"delimiter {self.delimiter!r} is not one character", fix="use one, or leave it out")
+        if not self.trim_ends >= 0:
+            raise OptionError(f"trim_ends is {self.trim_ends}", fix="use metres, 0 or more")
         _check_crs(self.crs, self.target_crs)
 
     @cached_property

@@ -42,7 +42,10 @@ __all__ = [
 OWN_COLUMNS = ("edge", "u", "v", "key", "origin")  # a table with these was written by us
 
 _PRIVATE_NAME = re.compile(
-    r"((trace|vehicle|drive|driver|trip|device|user)s?[_-]?(id|ids|uuid)?|vin|t|(first|last)?_?(seen|time|timestamp|date|datetime))s?",
+    r"((trace|vehicle|drive|driver|trip|journey|device|user|session)s?[_ -]?(id|ids|uuid|nr|no|name|key)?"
+    r"|tracks?[_ -]?(ids?|uuid|nr|no|name|key)|vin|imei|imsi|msisdn|iccid|(licen[cs]e|number|reg)?[_ -]?plate(_?(id|no|nr|number))?|t"
+    r"|((first|last|gps|gnss|start|end|stop|begin|device|utc|local|record(ed|ing)?|event|fix|position)[_ -]?)?"
+    r"(seen|time|timestamp|date|datetime)([_ -]?utc)?|(tracked|recorded|created|started|ended)[_ -]?at)s?",
     re.IGNORECASE,
 )
 

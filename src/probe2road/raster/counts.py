@@ -16,6 +16,7 @@ from collections.abc import Iterator
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from probe2road.crs import require_same_crs
 from probe2road.errors import InputError, OptionError
@@ -29,7 +30,10 @@ __all__ = [
     "fleet_grid",
     "rasterize",
     "rasterize_windows",
+    "without_rare",
 ]
+
+_BESIDE = 20.0  # m, how far from a trace its camera sees
 
 logger = logging.getLogger(__name__)
 
@@ -361,3 +365,33 @@ def _count_points(
     for point in range(len(row)):
         if 0 <= row[point] < rows and 0 <= col[point] < cols:
             counts[channel[point], row[point], col[point]] += np.uint32(1)
+
+
+def without_rare(counts: NDArray[np.uint32], grid: Grid, *, least: int) -> NDArray[np.uint32]:
+    """Return counts without what few traces stand behind, for pictures that leave the house.
+
+    Parameters
+    ----------
+    counts
+        From `rasterize`, shape ``(channel, row, col)``.
+    grid
+        Where they are.
+    least
+        Traces that a pixel needs. Semantic points stay where such a pixel is within 20 m. 1 keeps everything.
+
+    Examples
+    --------
+    >>> grid = Grid.from_bounds((0, 0, 3, 1), crs="EPSG:32616")
+    >>> without_rare(np.array([[[3, 1, 2]], [[0, 0, 0]], [[0, 0, 0]]], np.uint32), grid, least=2)[0].tolist()
+    [[3, 0, 2]]
+    """
+    if least <= 1:
+        return counts
+    often = counts[0] >= least
+    shown = np.where(often, counts, 0)
+    reach = max(1, round(_BESIDE / grid.resolution))
+    beside = (
+        ndimage.uniform_filter(often.astype(np.float32), 2 * reach + 1, mode="constant") > 0.5 / (2 * reach + 1) ** 2
+    )
+    shown[1:] = np.where(beside, counts[1:], 0)
+    return shown

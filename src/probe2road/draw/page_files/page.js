@@ -154,7 +154,9 @@ try {
 } catch (error) { // no WebGL: say so instead of showing an empty page
   document.body.dataset.error = error.message;
   state("error");
-  element("summary").textContent = `The map cannot be drawn: ${error.message}`;
+  element("summary").textContent = /webgl/i.test(error.message) // MapLibre puts a record of the context there
+    ? "The map needs WebGL, which this browser does not offer: turn on hardware acceleration, or draw a picture (.png)."
+    : `The map cannot be drawn: ${String(error.message).slice(0, 200)}`;
 }
 
 element("close").addEventListener("click", () => selectEdge(null));
