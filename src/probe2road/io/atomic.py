@@ -26,7 +26,16 @@ from pathlib import Path
 
 from probe2road.errors import OutputError, Probe2RoadError
 
-__all__ = ["atomic_path", "atomic_paths", "is_workshop", "make_folder", "require_place", "settled", "sweep_leftovers"]
+__all__ = [
+    "atomic_path",
+    "atomic_paths",
+    "discard",
+    "is_workshop",
+    "make_folder",
+    "require_place",
+    "settled",
+    "sweep_leftovers",
+]
 
 _PART, _COMMIT = ".p2r-part", ".p2r-commit"
 _CONTENT = "content.json"  # in a commit: the files that belong together, and which of them are no more
@@ -266,6 +275,22 @@ def _refusal_of_disk(folder: Path) -> str | None:
     except OSError as error:
         return _NO_ROOM.get(error.errno or 0)
     return None
+
+
+def discard(folder: Path, name: str) -> None:
+    """Remove a folder beside a file in one step; what a kill leaves of it is swept by the next write of the file.
+
+    Parameters
+    ----------
+    folder
+        What goes; nothing happens where it does not exist.
+    name
+        Of the file.
+    """
+    doomed = folder.with_name(f".{name}.{_HOST}-{os.getpid()}-discarded{_PART}")
+    with suppress(OSError):
+        folder.replace(doomed)
+        shutil.rmtree(doomed, ignore_errors=True)
 
 
 def is_workshop(path: Path) -> bool:

@@ -43,7 +43,8 @@ OWN_COLUMNS = ("edge", "u", "v", "key", "origin")  # a table with these was writ
 
 _PRIVATE_NAME = re.compile(
     r"((trace|vehicle|drive|driver|trip|journey|device|user|session)s?[_ -]?(id|ids|uuid|nr|no|name|key)?"
-    r"|tracks?[_ -]?(ids?|uuid|nr|no|name|key)|vin|imei|imsi|msisdn|iccid|(licen[cs]e|number|reg)?[_ -]?plate(_?(id|no|nr|number))?|t"
+    r"|tracks?[_ -]?(ids?|uuid|nr|no|name|key)|vin|imei|imsi|msisdn|iccid"
+    r"|(licen[cs]e|number|reg)?[_ -]?plate(_?(id|no|nr|number))?|t"
     r"|((first|last|gps|gnss|start|end|stop|begin|device|utc|local|record(ed|ing)?|event|fix|position)[_ -]?)?"
     r"(seen|time|timestamp|date|datetime)([_ -]?utc)?|(tracked|recorded|created|started|ended)[_ -]?at)s?",
     re.IGNORECASE,

@@ -8,10 +8,13 @@ those tags before an upload.
 
 from __future__ import annotations
 
+import ctypes
 import logging
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import geopandas as gpd
@@ -189,12 +192,25 @@ def write_osm(graph: RoadGraph, path: str | PathLike[str]) -> None:
     tags = _way_tags(graph)
     header = osmium.io.Header()
     header.set("generator", f"{_GENERATOR}{crs_to_text(graph.crs)}")
-    with atomic_path(path) as temporary, osmium.SimpleWriter(str(temporary), header=header) as writer:
+    with atomic_path(path) as temporary, _writer(temporary, header) as writer:
         for number, (lon, lat, z) in enumerate(positions.tolist(), start=1):
             height = {"ele": f"{z:.3f}"} if np.isfinite(z) else {}
             writer.add_node(osmium.osm.mutable.Node(id=-number, version=1, location=(lon, lat), tags=height))
         for number, (refs, pairs) in enumerate(zip(node_lists, tags, strict=True), start=1):
             writer.add_way(osmium.osm.mutable.Way(id=-number, version=1, nodes=refs, tags=pairs))
+
+
+@contextmanager
+def _writer(path: Path, header: osmium.io.Header) -> Iterator[osmium.SimpleWriter]:
+    """Open a writer of osmium, and survive a disk that takes nothing more."""
+    writer = osmium.SimpleWriter(str(path), header=header)
+    try:
+        yield writer
+        writer.close()
+    except RuntimeError:
+        # A writer that failed ends the process when it is taken down (osmium flushes it once more): it never is.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(writer))
+        raise
 
 
 def _numbered_nodes(graph: RoadGraph) -> tuple[NDArray[np.float64], list[list[int]]]:

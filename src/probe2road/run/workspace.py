@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from probe2road.errors import OutputError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.io.atomic import atomic_path, is_workshop, make_folder, sweep_leftovers
+from probe2road.io.atomic import atomic_path, discard, is_workshop, make_folder, sweep_leftovers
 from probe2road.io.graph_files import read_graph
 from probe2road.io.graph_readers import read_note
 from probe2road.io.graph_writers import write_geopackage
@@ -305,7 +305,7 @@ def resumable(output: str | Path) -> Iterator[Path]:
         raise OutputError(f"folder {output.parent} does not exist", where=output, fix="create it first")
     folder = output.parent / f".{output.name}.probe2road"
     yield folder
-    shutil.rmtree(folder, ignore_errors=True)
+    discard(folder, output.name)
 
 
 def copy_segmentation(folder: Path, target: Path) -> None:

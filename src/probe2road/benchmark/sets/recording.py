@@ -26,7 +26,7 @@ import shapely
 from probe2road.benchmark.sets.residual import ResidualModel, align_drives
 from probe2road.errors import OptionError, OutputError
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.io.atomic import atomic_path, make_folder
+from probe2road.io.atomic import atomic_path, make_folder, sweep_leftovers
 from probe2road.io.fleet_writer import ROW_GROUP, bounding_box, point_table, with_geo
 from probe2road.io.graph_files import write_graph
 from probe2road.run.progress import Progress
@@ -202,6 +202,11 @@ def _open(folder: Path, run: Mapping[str, Any]) -> Path | None:
     make_folder(folder)
     done, portions = folder / RUN_FILE, folder / _PORTIONS
     mark = portions / RUN_FILE
+    sweep_leftovers(folder)
+    if portions.is_dir():
+        sweep_leftovers(portions)
+        if not any(portions.iterdir()):
+            portions.rmdir()  # of a run that was killed before its mark
     if done.exists():
         if _same_run(done, run):
             shutil.rmtree(portions, ignore_errors=True)
@@ -287,8 +292,6 @@ def _write_portion(chunk: FleetChunk, path: Path, residual: ResidualModel | None
 
 def _join(network: RoadNetwork, portions: Path, recording: Recording, run: Mapping[str, Any]) -> dict[str, float]:
     """Join the portions to the files of the recording; the last file says that all are there."""
-    for stray in recording.folder.glob(".*.*"):  # where an earlier run was killed as it wrote a file
-        shutil.rmtree(stray, ignore_errors=True)
     parts = _complete(portions)
     abouts = [_about(part) for part in parts]
     counts: dict[str, float] = {"drives": sum(about["drives"] for about in abouts)}
