@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Proj, Transformer
 from pyproj.exceptions import CRSError as ProjCRSError
+from pyproj.exceptions import ProjError
 
 from probe2road.errors import CRSError
 
@@ -29,6 +30,7 @@ __all__ = [
     "same_crs",
     "transform",
     "turn_headings",
+    "working_crs",
 ]
 
 logger = logging.getLogger(__name__)
@@ -158,6 +160,71 @@ def is_true_to_scale(crs: CRS, lon: ArrayLike, lat: ArrayLike) -> bool:
     factors = Proj(crs).get_factors(np.asarray(lon, np.float64), np.asarray(lat, np.float64))
     scales = np.concatenate([np.ravel(factors.meridional_scale), np.ravel(factors.parallel_scale)])
     return bool((np.abs(scales - 1.0) <= _SCALE_TOLERANCE).all())
+
+
+def working_crs(
+    source: CRS, x: ArrayLike, y: ArrayLike, *, target_crs: Any = None, own: bool = False, where: object = None
+) -> CRS:
+    """Return the metric CRS to work in, for data at some positions in another CRS.
+
+    Parameters
+    ----------
+    source
+        CRS of the positions.
+    x, y
+        Positions; the extremes are enough.
+    target_crs
+        What the user wants; it must be true to scale where the data lies.
+    own
+        Whether a graph of ours comes back: it keeps the CRS in which it was made.
+    where
+        The file, for messages.
+
+    Returns
+    -------
+    CRS
+        The wanted one; else the data's own if it is in metres and true to scale; else a local one.
+
+    Raises
+    ------
+    CRSError
+        If the wanted CRS is not metric or not true to scale, if the data's own is in other units, or if its positions
+        are nowhere on Earth.
+
+    Examples
+    --------
+    >>> mercator = CRS.from_epsg(3857)
+    >>> working_crs(mercator, [-9757000.0], [5142000.0]).to_epsg()
+    32616
+    >>> working_crs(mercator, [-9757000.0], [5142000.0], target_crs=3857)
+    Traceback (most recent call last):
+        ...
+    probe2road.errors.CRSError: a metre of WGS 84 / Pseudo-Mercator is no metre on the ground here; name another ...
+    """
+    try:
+        lon, lat = (np.asarray(values, np.float64) for values in transform(x, y, source, WGS84))
+        placed = np.isfinite(lon) & np.isfinite(lat) & (np.abs(lat) <= 90.0)
+    except ProjError as error:
+        raise CRSError(
+            f"coordinates in {source.name} lie nowhere on Earth", where=where, fix="check the CRS"
+        ) from error
+    if lon.size and not placed.all():
+        fix = "check the CRS and the order of the coordinates"
+        raise CRSError(f"coordinates lie outside of {source.name}", where=where, fix=fix)
+    if target_crs is not None:
+        target = require_metric(parse_crs(target_crs, where=where), where=where)
+        if not own and lon.size and not is_true_to_scale(target, lon, lat):
+            fix = f'name another, for example target_crs="{crs_to_text(local_crs(lon, lat))}", or none'
+            raise CRSError(f"a metre of {target.name} is no metre on the ground here", where=where, fix=fix)
+        return target
+    if source.is_geographic:
+        return local_crs(lon, lat)
+    require_metric(source, where=where)
+    if own or not lon.size or is_true_to_scale(source, lon, lat):
+        return source
+    local = local_crs(lon, lat)
+    logger.info("%s: a metre of %s is no metre on the ground here: projected to %s", where, source.name, local.name)
+    return local
 
 
 def same_crs(first: CRS, second: CRS) -> bool:

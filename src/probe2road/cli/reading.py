@@ -51,6 +51,7 @@ FLAGS: Mapping[str, str] = {
     "delimiter": "--delimiter",
     "header": "--no-header",
     "layer": "--layer",
+    "inner_junctions": "--no-inner-junctions",
     "segmenter": "--segmenter",
     "resolution": "--resolution",
     "data": "--data",
@@ -135,12 +136,21 @@ def graph_options(
         str | None,
         typer.Option(help="CRS of the graph's coordinates, where its file names none.", rich_help_panel=_GRAPH),
     ] = None,
+    no_inner_junctions: Annotated[
+        bool,
+        typer.Option(
+            "--no-inner-junctions",
+            help="Lines of a GIS file meet at their ends only, not where one ends on an inner vertex of another.",
+            rich_help_panel=_GRAPH,
+        ),
+    ] = False,
 ) -> Said[GraphFormat]:
     """Return what is said of the file of a graph."""
     from probe2road.io.formats import GraphFormat
 
-    flags = {"layer": "--layer", "crs": "--graph-crs"}
-    return Said(GraphFormat, "graph_format", {"layer": layer, "crs": graph_crs}, flags)
+    flags = {"layer": "--layer", "crs": "--graph-crs", "inner_junctions": "--no-inner-junctions"}
+    fields = {"layer": layer, "crs": graph_crs, "inner_junctions": False if no_inner_junctions else None}
+    return Said(GraphFormat, "graph_format", fields, flags)
 
 
 def reference_options(
@@ -151,12 +161,26 @@ def reference_options(
         str | None,
         typer.Option(help="CRS of the reference's coordinates, where its file names none.", rich_help_panel=_REFERENCE),
     ] = None,
+    no_reference_inner_junctions: Annotated[
+        bool,
+        typer.Option(
+            "--no-reference-inner-junctions",
+            help="Lines of a GIS file meet at their ends only, not where one ends on an inner vertex of another.",
+            rich_help_panel=_REFERENCE,
+        ),
+    ] = False,
 ) -> Said[GraphFormat]:
     """Return what is said of the file of a reference graph."""
     from probe2road.io.formats import GraphFormat
 
-    flags = {"layer": "--reference-layer", "crs": "--reference-crs"}
-    return Said(GraphFormat, "reference_format", {"layer": reference_layer, "crs": reference_crs}, flags)
+    flags = {
+        "layer": "--reference-layer",
+        "crs": "--reference-crs",
+        "inner_junctions": "--no-reference-inner-junctions",
+    }
+    inner = False if no_reference_inner_junctions else None
+    fields = {"layer": reference_layer, "crs": reference_crs, "inner_junctions": inner}
+    return Said(GraphFormat, "reference_format", fields, flags)
 
 
 def takes(
@@ -177,7 +201,7 @@ def takes(
     ... def show(path: str, graph: Said) -> None:
     ...     print(path, graph.fields["layer"])
     >>> list(signature(show).parameters)
-    ['path', 'layer']
+    ['path', 'layer', 'no_inner_junctions']
     >>> show(path="roads.gpkg", layer="streets")
     roads.gpkg streets
     """

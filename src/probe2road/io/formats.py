@@ -88,6 +88,7 @@ class GraphFormat:
     crs: CRS | str | int | None = None  # of the coordinates, where the file names none
     target_crs: CRS | str | int | None = None  # metric CRS to work in; else the recorded, the file's own or a local one
     layer: str | None = None  # of the edges, in a file of several
+    inner_junctions: bool = True  # whether lines of a GIS file are cut at inner vertices on which another line ends
 
     def __post_init__(self) -> None:
         """Refuse what is no CRS."""
@@ -103,7 +104,7 @@ def adjusted(format: F, **given: Any) -> F:
     Examples
     --------
     >>> adjusted(GraphFormat(crs="EPSG:32616"), layer="streets", crs=None)
-    GraphFormat(crs='EPSG:32616', target_crs=None, layer='streets')
+    GraphFormat(crs='EPSG:32616', target_crs=None, layer='streets', inner_junctions=True)
     """
     return replace(format, **{name: value for name, value in given.items() if value is not None})
 

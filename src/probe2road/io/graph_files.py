@@ -18,7 +18,9 @@ from probe2road.io.formats import GraphFormat, adjusted
 from probe2road.io.graph_networkx import read_graphml, write_graphml
 from probe2road.io.graph_readers import read_parquet_graph, read_vector_graph
 from probe2road.io.graph_writers import write_flatgeobuf, write_geojson, write_geopackage, write_geoparquet
+from probe2road.io.guard import located
 from probe2road.io.osm import read_osm, write_osm
+from probe2road.io.osm_json import holds_osm_json
 
 __all__ = ["READABLE", "WRITABLE", "graph_format", "read_graph", "write_graph"]
 
@@ -74,11 +76,13 @@ def read_graph(
     crs: Any = None,
     target_crs: Any = None,
     layer: str | None = None,
+    inner_junctions: bool | None = None,
 ) -> RoadGraph:
     """Read a road graph from a file, in the format that its suffix names.
 
     A file that probe2road wrote comes back as it was, to the precision of the format. A file of plain lines
-    becomes a graph of origin ``reference``: edges join where the ends of lines meet. OSM ways are split where
+    becomes a graph of origin ``reference``: edges join where the ends of lines meet, and where a line ends on an inner
+    vertex of another; a line for each direction of a street becomes one edge. OSM ways are split where
     they share a node; see `probe2road.io.osm.read_osm`, also for reading other than drivable roads.
 
     Parameters
@@ -93,6 +97,8 @@ def read_graph(
         Metric CRS to work in. Otherwise the recorded one, the file's own, or, for degrees, the local one.
     layer
         Layer of the edges, in a file of several.
+    inner_junctions
+        Whether lines of a GIS file are cut at inner vertices on which another line ends; True by default.
 
     Raises
     ------
@@ -105,20 +111,25 @@ def read_graph(
     OptionError
         If the suffix is of no format we read.
     """
-    format = adjusted(format or GraphFormat(), crs=crs, target_crs=target_crs, layer=layer)
+    format = adjusted(
+        format or GraphFormat(), crs=crs, target_crs=target_crs, layer=layer, inner_junctions=inner_junctions
+    )
     kind = graph_format(path, READABLE)
     file = settled(path)
     if not file.is_file():
         raise MissingFileError("no such file", where=path, fix="check the path")
     if file.stat().st_size == 0:
         raise InputError("the file is empty", where=path, fix="check that it is complete")
-    if kind == "OSM":
-        return read_osm(path, target_crs=format.target_crs)
-    if kind == "GraphML":
-        return read_graphml(path, target_crs=format.target_crs)
-    if kind == "GeoParquet":
-        return read_parquet_graph(path, crs=format.crs, target_crs=format.target_crs)
-    return read_vector_graph(path, crs=format.crs, target_crs=format.target_crs, layer=format.layer)
+    with located(path):
+        if kind == "OSM" or (kind == "GeoJSON" and holds_osm_json(path)):
+            return read_osm(path, target_crs=format.target_crs)
+        if kind == "GraphML":
+            return read_graphml(path, target_crs=format.target_crs)
+        said: dict[str, Any] = {"crs": format.crs, "target_crs": format.target_crs}
+        said["inner_junctions"] = format.inner_junctions
+        if kind == "GeoParquet":
+            return read_parquet_graph(path, **said)
+        return read_vector_graph(path, layer=format.layer, **said)
 
 
 WRITABLE = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from os import PathLike
 from typing import Any
-from xml.etree.ElementTree import ParseError
 
 import geopandas as gpd
 import networkx as nx
@@ -13,7 +12,7 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from probe2road.crs import local_crs, parse_crs, require_metric
+from probe2road.crs import parse_crs, working_crs
 from probe2road.errors import CRSError, InputError
 from probe2road.graph.check import require_sound
 from probe2road.graph.direction import told_direction
@@ -22,7 +21,17 @@ from probe2road.graph.networkx import present
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import EDGE_DTYPES, empty_turns, finish_edges, move_ends
 from probe2road.io.atomic import atomic_path
-from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table, outgoing, text_value, typed_column
+from probe2road.io.graph_tables import (
+    OWN_COLUMNS,
+    graph_from_edge_table,
+    outgoing,
+    projected,
+    require_finite,
+    require_lines,
+    text_value,
+    typed_column,
+)
+from probe2road.io.guard import parsing
 
 __all__ = ["from_networkx", "read_graphml", "to_networkx", "write_graphml"]
 
@@ -66,36 +75,50 @@ def from_networkx(graph: nx.Graph, *, target_crs: Any = None) -> RoadGraph:
     >>> from_networkx(foreign).edges[["u", "v", "length", "highway"]].values.tolist()
     [[7, 9, 50.0, 'service']]
     """
-    source = parse_crs(graph.graph["crs"], where="NetworkX graph") if "crs" in graph.graph else None
+    fix = "set graph.graph['crs']"
+    return _road_graph(graph, target_crs=target_crs, where="NetworkX graph", no_crs=fix)
+
+
+def _road_graph(graph: nx.Graph, *, target_crs: Any, where: object, no_crs: str) -> RoadGraph:
+    """Do what `from_networkx` does; errors name the place, and say what to do where there is no CRS."""
+    source = parse_crs(graph.graph["crs"], where=where) if "crs" in graph.graph else None
     if source is None:
-        raise CRSError("has no CRS", where="NetworkX graph", fix="set graph.graph['crs']")
-    nodes = _nodes_from_networkx(graph, source)
+        raise CRSError("has no CRS", where=where, fix=no_crs)
+    nodes = _nodes_from_networkx(graph, source, where)
     rows = [
         {**data, "u": u, "v": v, "key": key} for u, v, key, data in nx.MultiDiGraph(graph).edges(keys=True, data=True)
     ]
     table = pd.DataFrame(rows, columns=None if rows else [*OWN_COLUMNS, "geometry"])
     lines = _drawn(table, nodes)
     edges = gpd.GeoDataFrame(table.drop(columns="geometry", errors="ignore"), geometry=lines, crs=source)
-    if target_crs is None:
-        x, y = nodes.geometry.x.to_numpy(), nodes.geometry.y.to_numpy()
-        target_crs = local_crs(x, y) if source.is_geographic else source
-    target = require_metric(parse_crs(target_crs), where="NetworkX graph")
-    nodes, edges = (part if source == target else part.to_crs(target) for part in (nodes, edges))
-    if set(OWN_COLUMNS) <= set(edges):
-        edges = _one_edge_per_id(edges)
-        return graph_from_edge_table(edges, nodes=nodes.reset_index(), where="NetworkX graph")
-    return _from_foreign(nodes, edges)
+    require_finite(nodes, where=where)
+    require_lines(edges, where=where)
+    own = set(OWN_COLUMNS) <= set(edges)
+    if own and "geometry" in table and table["geometry"].isna().any():
+        raise InputError("some edges have lost their geometry", where=where, fix="write it again")
+    if own and not edges.empty:
+        edges = _one_edge_per_id(edges, where)
+    x, y = nodes.get_coordinates().to_numpy().T
+    target = working_crs(source, x, y, target_crs=target_crs, own=own, where=where)
+    nodes, edges = (projected(part, target, where=where) for part in (nodes, edges))
+    if own:
+        return graph_from_edge_table(edges, nodes=nodes.reset_index(), where=where)
+    return _from_foreign(nodes, edges, where)
 
 
-def _nodes_from_networkx(graph: nx.Graph, crs: Any) -> gpd.GeoDataFrame:
+def _nodes_from_networkx(graph: nx.Graph, crs: Any, where: object) -> gpd.GeoDataFrame:
     """Return the node table, in the CRS of the graph."""
     table = pd.DataFrame([data for _, data in graph.nodes(data=True)])
     if not {"x", "y"} <= set(table) and len(graph):
-        raise InputError("nodes have no x and y", where="NetworkX graph", fix="set their coordinates")
+        raise InputError("nodes have no x and y", where=where, fix="set their coordinates")
     ids = list(graph.nodes)
     if not all(isinstance(node, int | np.integer) for node in ids):
-        raise InputError("node ids are not integers", where="NetworkX graph", fix="renumber the nodes")
-    points = shapely.points(table["x"], table["y"]) if len(table) else np.zeros(0, object)
+        raise InputError("node ids are not integers", where=where, fix="renumber the nodes")
+    with parsing(where, "x and y of the nodes are not numbers", fix="check that it is complete"):
+        x, y = (table[name].to_numpy(np.float64, na_value=np.nan) for name in ("x", "y")) if ids else (np.zeros(0),) * 2
+    if not np.isfinite([x, y]).all():
+        raise InputError("some nodes have no x and y", where=where, fix="set their coordinates")
+    points = shapely.points(x, y)
     further = table.drop(columns=[*_DERIVED_NODE_COLUMNS, "geometry"], errors="ignore").map(_single_value)
     return gpd.GeoDataFrame(further, geometry=points, crs=crs).set_index(pd.Index(ids, name="node", dtype="int64"))
 
@@ -111,10 +134,13 @@ def _drawn(table: pd.DataFrame, nodes: gpd.GeoDataFrame) -> NDArray[Any]:
     return np.where(pd.notna(given), given, straight)
 
 
-def _one_edge_per_id(edges: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+def _one_edge_per_id(edges: gpd.GeoDataFrame, where: object) -> gpd.GeoDataFrame:
     """Undo the two directions of `to_networkx`: one row per ``edge``, turned back where only the reverse is there."""
-    edges = edges.sort_values("reversed", kind="stable").drop_duplicates("edge") if len(edges) else edges
-    turned = edges.get("reversed", pd.Series(False, edges.index)).to_numpy(bool)
+    flags = edges.get("reversed", pd.Series(False, edges.index))
+    if not flags.map(lambda flag: isinstance(flag, bool | np.bool_)).all():
+        raise InputError("edges do not say whether they are reversed", where=where, fix="write it again")
+    edges = edges.assign(reversed=flags.astype(bool)).sort_values("reversed", kind="stable").drop_duplicates("edge")
+    turned = edges["reversed"].to_numpy(bool)
     lines = edges.geometry.to_numpy()
     forward, backward = (edges.get(name, pd.Series(pd.NA, edges.index)) for name in ("forward", "backward"))
     result = edges.assign(
@@ -128,7 +154,7 @@ def _one_edge_per_id(edges: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     return result.drop(columns=["oneway", "reversed"], errors="ignore").rename(columns={"oneway_tag": "oneway"})
 
 
-def _from_foreign(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame) -> RoadGraph:
+def _from_foreign(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame, where: object) -> RoadGraph:
     """Make one edge of the two directions of a road in an OSMnx graph."""
     low, high = edges[["u", "v"]].min(axis=1), edges[["u", "v"]].max(axis=1)
     shape = shapely.to_wkb(shapely.normalize(edges.geometry.to_numpy()))
@@ -151,7 +177,7 @@ def _from_foreign(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame) -> RoadGraph
     for column in further.columns.drop(["u", "v", "geometry"]):
         further[column] = further[column].map(_single_value)
     graph = RoadGraph(nodes, finish_edges(further.assign(origin="reference")), empty_turns())
-    require_sound(graph, where="NetworkX graph")
+    require_sound(graph, where=where)
     return graph
 
 
@@ -201,16 +227,15 @@ def read_graphml(path: str | PathLike[str], *, target_crs: Any = None) -> RoadGr
     CRSError
         If it names no CRS.
     """
-    try:
+    with parsing(path, "cannot be read as GraphML"):
         text = nx.read_graphml(path, node_type=int, force_multigraph=True)
-    except (ParseError, nx.NetworkXError, ValueError, KeyError) as error:
-        raise InputError(f"cannot be read as GraphML ({error})", where=path, fix="check that it is complete") from error
-    typed = nx.MultiDiGraph(**text.graph)
-    typed.add_nodes_from(zip(text.nodes, _typed_rows([data for _, data in text.nodes(data=True)]), strict=True))
-    edges = list(text.edges(keys=True, data=True))
-    rows = _typed_rows([{name: data[name] for name in data if name != "id"} for *_, data in edges])
-    typed.add_edges_from((u, v, key, row) for (u, v, key, _), row in zip(edges, rows, strict=True))
-    return from_networkx(typed, target_crs=target_crs)
+        typed = nx.MultiDiGraph(**text.graph)
+        typed.add_nodes_from(zip(text.nodes, _typed_rows([data for _, data in text.nodes(data=True)]), strict=True))
+        edges = list(text.edges(keys=True, data=True))
+        rows = _typed_rows([{name: data[name] for name in data if name != "id"} for *_, data in edges])
+        typed.add_edges_from((u, v, key, row) for (u, v, key, _), row in zip(edges, rows, strict=True))
+    fix = "write it with a CRS, as osmnx.io.save_graphml does"
+    return _road_graph(typed, target_crs=target_crs, where=path, no_crs=fix)
 
 
 def _typed_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -220,7 +245,11 @@ def _typed_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     table = pd.DataFrame(rows, index=pd.RangeIndex(len(rows)))
     for column in table:
         values = table[column]
-        table[column] = (
-            shapely.from_wkt(values.where(values.notna(), None)) if column == "geometry" else typed_column(values)
-        )
+        table[column] = _lines_from_text(values) if column == "geometry" else typed_column(values)
     return present(table)
+
+
+def _lines_from_text(text: pd.Series) -> NDArray[Any]:
+    """Read WKT; an edge without any, which OSMnx leaves out on straight ones, gets None."""
+    plain = text.astype(object)
+    return np.asarray(shapely.from_wkt(plain.where(plain.notna(), None).to_numpy(object)), object)

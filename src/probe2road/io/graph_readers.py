@@ -8,34 +8,44 @@ from __future__ import annotations
 
 import json
 import logging
-import warnings
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import geopandas as gpd
+import numpy as np
 import pandas as pd
-import pyarrow as pa
 import pyogrio
+import shapely
+from numpy.typing import NDArray
 from pyogrio.errors import DataLayerError, DataSourceError
 from pyproj import CRS
 
-from probe2road.crs import WGS84, local_crs, parse_crs, require_metric
+from probe2road.crs import parse_crs, require_metric, working_crs
 from probe2road.errors import CRSError, InputError
 from probe2road.graph.direction import in_driving_direction
+from probe2road.graph.lines import cut_at_ends, one_line_each
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.io.atomic import settled
-from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table
+from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table, projected, require_finite
 from probe2road.io.graph_writers import GRAPH_MARK, parquet_siblings
+from probe2road.io.guard import parsing
 
 __all__ = ["graph_from_table", "read_note", "read_parquet_graph", "read_vector_graph"]
 
 logger = logging.getLogger(__name__)
 
+_SNAP = 0.01  # m; ends of lines nearer than this are one place
+
 
 def read_vector_graph(
-    path: str | PathLike[str], *, crs: Any = None, target_crs: Any = None, layer: str | None = None
+    path: str | PathLike[str],
+    *,
+    crs: Any = None,
+    target_crs: Any = None,
+    layer: str | None = None,
+    inner_junctions: bool = True,
 ) -> RoadGraph:
     """Read a graph from GeoPackage, FlatGeobuf or GeoJSON.
 
@@ -49,6 +59,8 @@ def read_vector_graph(
         Metric CRS to work in; otherwise the file's own, or the one recorded in it, or a local one.
     layer
         Layer of the edges; otherwise ``edges`` where there is one, or the only layer.
+    inner_junctions
+        Whether a line that is not ours is cut at its inner vertices on which another one ends.
 
     Raises
     ------
@@ -58,23 +70,27 @@ def read_vector_graph(
         If there is no CRS.
     """
     path = Path(path)
-    try:
+    with parsing(path, "cannot be read"):
         layers = [str(name) for name in pyogrio.list_layers(path)[:, 0]]
         chosen = _edge_layer(layers, layer, path)
-        table = _read_layer(path, chosen)
+        table = pyogrio.read_dataframe(path, layer=chosen)
         own = set(OWN_COLUMNS) <= set(table)
-        nodes = _read_layer(path, "nodes") if own and "nodes" in layers else None
-        turns = _read_layer(path, "turns") if own and "turns" in layers else None
-    except (DataSourceError, DataLayerError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"cannot be read ({_first_line(error)})", where=path, fix="check that it is complete"
-        ) from error
+        nodes = pyogrio.read_dataframe(path, layer="nodes") if own and "nodes" in layers else None
+        turns = pyogrio.read_dataframe(path, layer="turns") if own and "turns" in layers else None
     recorded = _recorded_crs(path) if path.suffix.lower() in (".geojson", ".json") else None
     if recorded is not None:
         target_crs = target_crs or recorded
         if table.empty:  # without features there are no columns either
             return empty_graph(target_crs)
-    return graph_from_table(table, nodes=nodes, turns=turns, crs=crs, target_crs=target_crs, where=path)
+    return graph_from_table(
+        table,
+        nodes=nodes,
+        turns=turns,
+        crs=crs,
+        target_crs=target_crs,
+        inner_junctions=inner_junctions,
+        where=path,
+    )
 
 
 def read_note(path: str | PathLike[str], name: str) -> str | None:
@@ -89,7 +105,9 @@ def read_note(path: str | PathLike[str], name: str) -> str | None:
     return notes.get(name)
 
 
-def read_parquet_graph(path: str | PathLike[str], *, crs: Any = None, target_crs: Any = None) -> RoadGraph:
+def read_parquet_graph(
+    path: str | PathLike[str], *, crs: Any = None, target_crs: Any = None, inner_junctions: bool = True
+) -> RoadGraph:
     """Read a graph from GeoParquet; nodes and turns are taken from the files beside it where they are.
 
     The parameters and errors are those of `read_vector_graph`.
@@ -97,22 +115,26 @@ def read_parquet_graph(path: str | PathLike[str], *, crs: Any = None, target_crs
     path = Path(path)
     nodes_path, turns_path = parquet_siblings(path)
     nodes_path, turns_path = settled(nodes_path), settled(turns_path)
-    try:
+    with parsing(path, "cannot be read as GeoParquet"):
         table = gpd.read_parquet(settled(path))
         own = set(OWN_COLUMNS) <= set(table)
         nodes = gpd.read_parquet(nodes_path) if own and nodes_path.is_file() else None
         turns = pd.read_parquet(turns_path) if own and turns_path.is_file() else None
-    except (pa.ArrowInvalid, OSError, ValueError) as error:
-        raise InputError(
-            f"cannot be read as GeoParquet ({_first_line(error)})", where=path, fix="check that it is complete"
-        ) from error
     mark = table.attrs.pop(GRAPH_MARK, None)
     for beside, sibling in ((nodes_path, nodes), (turns_path, turns)):
         other = None if sibling is None else sibling.attrs.pop(GRAPH_MARK, None)
         if None not in (mark, other) and mark != other:
             fix = "take both from one run, or remove the file beside the edges"
             raise InputError(f"the file beside it, {beside.name}, is of another graph", where=path, fix=fix)
-    return graph_from_table(table, nodes=nodes, turns=turns, crs=crs, target_crs=target_crs, where=path)
+    return graph_from_table(
+        table,
+        nodes=nodes,
+        turns=turns,
+        crs=crs,
+        target_crs=target_crs,
+        inner_junctions=inner_junctions,
+        where=path,
+    )
 
 
 def graph_from_table(
@@ -122,12 +144,15 @@ def graph_from_table(
     turns: pd.DataFrame | None = None,
     crs: Any = None,
     target_crs: Any = None,
+    inner_junctions: bool = True,
     where: object,
 ) -> RoadGraph:
     """Make a graph of a table of lines: our own edges as they were, any others as a reference graph.
 
     One-way edges run in their driving direction: a line whose ``oneway`` says that it is driven against its course
-    is turned.
+    is turned. Two lines of a reference that run through the same places in opposite directions are one edge. With
+    ``inner_junctions`` they are cut at inner vertices on which another line ends. A reference whose CRS is not true to
+    scale, such as Web Mercator, is projected to the local one.
 
     Raises
     ------
@@ -148,14 +173,20 @@ def graph_from_table(
     if not own and not len(table):
         raise InputError("holds no features", where=where, fix="give a file with road centrelines")
     table = _with_crs(table, crs, where)
-    target = _target(table, target_crs, where)
-    table = table if table.crs == target else table.to_crs(target)
-    if own:
-        nodes = nodes if nodes is None or nodes.crs == target else nodes.to_crs(target)
-        return graph_from_edge_table(table, nodes=nodes, turns=turns, where=where)
-    graph = graph_from_lines(
-        table.geometry.to_numpy(), crs=target, origin="reference", attributes=_further_columns(table)
+    require_finite(table, where=where)
+    left, bottom, right, top = table.total_bounds if len(table) and not table.geometry.isna().all() else [[]] * 4
+    target = working_crs(
+        table.crs, np.hstack([left, right]), np.hstack([bottom, top]), target_crs=target_crs, own=own, where=where
     )
+    table = projected(table, target, where=where)
+    if own:
+        nodes = None if nodes is None else projected(nodes, target, where=where)
+        return graph_from_edge_table(table, nodes=nodes, turns=turns, where=where)
+    lines, attributes = _streets(table)
+    if inner_junctions:
+        lines, line = cut_at_ends(lines, snap=_SNAP)
+        attributes = attributes.iloc[line]
+    graph = graph_from_lines(lines, crs=target, origin="reference", snap=_SNAP, attributes=attributes)
     if graph.edges.empty:
         kinds = ", ".join(sorted({str(kind) for kind in table.geom_type.dropna()})) or "no geometry"
         raise InputError(f"holds no lines ({kinds})", where=where, fix="give a file with road centrelines")
@@ -172,13 +203,6 @@ def _edge_layer(layers: list[str], wanted: str | None, path: Path) -> str:
         fix = f"name the layer of the edges{example}"
         raise InputError(f"{what} (there are: {', '.join(layers)})", where=path, fix=fix)
     return wanted
-
-
-def _read_layer(path: Path, layer: str) -> Any:
-    with warnings.catch_warnings():
-        # GDAL warns of what we check ourselves, such as rings that are not closed.
-        warnings.simplefilter("ignore", RuntimeWarning)
-        return pyogrio.read_dataframe(path, layer=layer)
 
 
 def _recorded_crs(path: Path) -> CRS | None:
@@ -205,22 +229,14 @@ def _with_crs(table: gpd.GeoDataFrame, crs: Any, where: object) -> gpd.GeoDataFr
     return table.set_crs(parse_crs(crs, where=where))
 
 
-def _target(table: gpd.GeoDataFrame, target_crs: Any, where: object) -> CRS:
-    """Return the metric CRS to work in."""
-    if target_crs is not None:
-        return require_metric(parse_crs(target_crs, where=where), where=where)
-    if not table.crs.is_geographic:
-        return require_metric(table.crs, where=where)
-    left, bottom, right, top = table.to_crs(WGS84).total_bounds
-    return local_crs([left, right], [bottom, top])
+def _streets(table: gpd.GeoDataFrame) -> tuple[NDArray[Any], pd.DataFrame]:
+    """Return the lines of a file that is not ours, one for each street, with the columns to keep."""
+    parts, row = shapely.get_parts(table.geometry.to_numpy(), return_index=True)
+    lines = shapely.get_type_id(parts) == shapely.GeometryType.LINESTRING
+    return one_line_each(parts[lines], _further_columns(table).iloc[row[lines]])
 
 
 def _further_columns(table: gpd.GeoDataFrame) -> pd.DataFrame:
     """Return the columns to keep of a file that is not ours: none of them means what ours mean."""
     own = ["edge", "support", "score", "forward", "backward", "origin"]
     return pd.DataFrame(table.drop(columns=[table.geometry.name, *own], errors="ignore"))
-
-
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__

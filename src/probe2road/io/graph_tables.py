@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import shapely
 from numpy.typing import NDArray
+from pyproj import CRS
 
 from probe2road.errors import InputError, OutputError
 from probe2road.graph.check import require_sound
@@ -30,11 +31,15 @@ from probe2road.graph.tables import (
     move_ends,
     without_unknown_heights,
 )
+from probe2road.io.guard import parsing
 
 __all__ = [
     "OWN_COLUMNS",
     "graph_from_edge_table",
     "outgoing",
+    "projected",
+    "require_finite",
+    "require_lines",
     "text_value",
     "typed_column",
 ]
@@ -49,6 +54,8 @@ _PRIVATE_NAME = re.compile(
     r"(seen|time|timestamp|date|datetime)([_ -]?utc)?|(tracked|recorded|created|started|ended)[_ -]?at)s?",
     re.IGNORECASE,
 )
+
+_FARTHEST = 1e9  # m or degrees; no coordinate on Earth is larger in any CRS
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f]")
 
@@ -150,7 +157,8 @@ def graph_from_edge_table(
     InputError
         If a column cannot be converted, or the graph breaks an invariant.
     """
-    try:
+    require_lines(table, where=where)
+    with parsing(where, "the columns of the edges are damaged", fix="write it again"):
         turns = _turns_from_text(table) if turns is None else turns[list(TURN_DTYPES)].astype(TURN_DTYPES)
         edges = (
             table.drop(columns=TURNS_COLUMN, errors="ignore").astype({"edge": "int64"}).set_index("edge").sort_index()
@@ -159,17 +167,50 @@ def graph_from_edge_table(
         edges = edges.set_geometry(without_unknown_heights(edges.geometry.to_numpy()), crs=table.crs)
         text = [name for name in edges if name not in EDGE_DTYPES and pd.api.types.is_object_dtype(edges[name].dtype)]
         edges = in_driving_direction(finish_edges(edges.astype(dict.fromkeys(text, "str"))).assign(key=key))
-    except (ValueError, TypeError, KeyError) as error:
-        raise InputError(
-            f"the columns of the edges are damaged ({error})", where=where, fix="write it again"
-        ) from error
     if nodes is None:
         nodes, edges = _nodes_from_ends(edges)
     else:
-        nodes = nodes.astype({"node": "int64"}).set_index("node").sort_index()
+        with parsing(where, "the table of the nodes is damaged", fix="write it again"):
+            nodes = nodes.astype({"node": "int64"}).set_index("node").sort_index()
     graph = RoadGraph(nodes, edges, turns)
     require_sound(graph, where=where)
     return graph
+
+
+def require_finite(table: gpd.GeoDataFrame, *, where: object) -> None:
+    """Refuse geometry with coordinates that are no numbers."""
+    coordinates, row = shapely.get_coordinates(table.geometry.to_numpy(), return_index=True)
+    wrong = np.unique(row[~(np.abs(coordinates) < _FARTHEST).all(axis=1)])
+    if len(wrong):
+        fault = f"coordinates of {len(wrong)} features are no positions (first: row {wrong[0]})"
+        raise InputError(fault, where=where, fix="check that it is complete, and its CRS")
+
+
+def require_lines(table: gpd.GeoDataFrame, *, where: object) -> None:
+    """Refuse a table of our edges in which one is no line."""
+    geometry = table.geometry.to_numpy()
+    line = (shapely.get_type_id(geometry) == shapely.GeometryType.LINESTRING) & ~shapely.is_empty(geometry)
+    if not line.all():
+        fault = f"{int((~line).sum())} edges are no LineString (first: row {np.flatnonzero(~line)[0]})"
+        raise InputError(fault, where=where, fix="write it again")
+    require_finite(table, where=where)
+
+
+def projected(table: Any, target: CRS, *, where: object) -> gpd.GeoDataFrame:
+    """Return a table in another CRS.
+
+    Raises
+    ------
+    InputError
+        If it is no table of geometry with a CRS, or its positions cannot be projected.
+    """
+    if not isinstance(table, gpd.GeoDataFrame) or table.crs is None:
+        raise InputError("a table has no geometry or no CRS", where=where, fix="write it again")
+    if table.crs != target:
+        with parsing(where, f"cannot be projected to {target.name}", fix="check its CRS"):
+            table = table.to_crs(target)
+    require_finite(table, where=where)
+    return table
 
 
 def _nodes_from_ends(edges: gpd.GeoDataFrame) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:

@@ -25,7 +25,7 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from probe2road.crs import WGS84, crs_to_text, local_crs, parse_crs, require_metric, transform
+from probe2road.crs import WGS84, crs_to_text, parse_crs, transform, working_crs
 from probe2road.errors import InputError
 from probe2road.graph.direction import (
     DIRECTION_TAGS,
@@ -39,7 +39,9 @@ from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.graph.tables import edges_with_turns
 from probe2road.io.atomic import atomic_path
 from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table, outgoing, text_value, typed_column
-from probe2road.io.osm_ways import OsmWays, osm_errors, read_heights, read_ways, split_at_shared_nodes
+from probe2road.io.guard import parsing
+from probe2road.io.osm_json import holds_osm_json, read_json_heights, read_json_ways
+from probe2road.io.osm_ways import OsmWays, osm_errors, placed_parts, read_heights, read_ways, split_at_shared_nodes
 
 __all__ = ["DRIVABLE", "read_osm", "write_osm"]
 
@@ -69,7 +71,9 @@ def read_osm(
 ) -> RoadGraph:
     """Read the roads of an OSM extract (``.osm``, ``.osm.pbf`` and what else osmium reads).
 
-    Ways are split where they share a node, so that a bridge stays apart from the road below. A file written
+    Ways are split where they share a node, so that a bridge stays apart from the road below. Of a way that an extract
+    cuts, the parts inside are kept; what an editor has marked for deletion is gone. Positions may stand at the nodes or
+    at the ways (``out geom`` of Overpass), in XML, PBF or Overpass JSON. A file written
     by `write_osm` comes back as the graph it was, to the 1 cm of the format.
 
     Parameters
@@ -98,17 +102,42 @@ def read_osm(
     --------
     write_osm
     """
-    recorded = _recorded_crs(path)
-    ways = _usable(read_ways(path, None if recorded is not None else highways))
+    json = holds_osm_json(path)
+    recorded = None if json else _recorded_crs(path)
+    read = read_json_ways if json else read_ways
+    ways = _usable(read(path, None if recorded is not None else highways))
     if recorded is None and not len(ways.ids):
         classes = "any highway tag" if highways is None else f"highway = {', '.join(sorted(highways))}"
         raise InputError(f"holds no way with {classes}", where=path, fix="check the extract, or choose other classes")
-    if target_crs is None:
-        target_crs = recorded or local_crs(ways.lon, ways.lat)
-    target = require_metric(parse_crs(target_crs, where=path), where=path)
+    if recorded is None:
+        ways = _inside(ways, path)
+    placed = ways.placed
+    target = working_crs(
+        WGS84,
+        ways.lon[placed],
+        ways.lat[placed],
+        target_crs=target_crs or recorded,
+        own=recorded is not None,
+        where=path,
+    )
     if recorded is not None:
         return _restored(ways, target, path)
     return _split_at_junctions(ways, target, path)
+
+
+def _inside(ways: OsmWays, path: str | PathLike[str]) -> OsmWays:
+    """Keep the parts of ways whose nodes are in the file."""
+    beyond = np.unique(ways.way[~ways.placed])
+    parts = placed_parts(ways)
+    if not len(parts.ids):
+        fix = "make the extract with complete ways, or with positions (out geom; osmium add-locations-to-ways)"
+        raise InputError("no way has its nodes in the file", where=path, fix=fix)
+    if len(beyond):
+        left = len(beyond) - np.isin(ways.ids[beyond], parts.ids).sum()
+        logger.warning(
+            "%s: %d ways reach beyond the extract; the parts inside are kept, %d have none", path, len(beyond), left
+        )
+    return parts
 
 
 def _recorded_crs(path: str | PathLike[str]) -> CRS | None:
@@ -129,7 +158,9 @@ def _usable(ways: OsmWays) -> OsmWays:
 def _lines(ways: OsmWays, path: str | PathLike[str], owner: NDArray[np.int64], crs: CRS) -> NDArray[Any]:
     """Draw lines through vertices, those in three dimensions whose every node has a height."""
     x, y = transform(ways.lon, ways.lat, WGS84, crs)
-    heights = read_heights(path, ways)
+    heights = (read_json_heights if holds_osm_json(path) else read_heights)(path, ways)
+    if not (np.isfinite(x) & np.isfinite(y)).all():
+        raise InputError(f"positions cannot be projected to {crs.name}", where=path, fix="name another target_crs")
     lines = shapely.linestrings(np.column_stack([x, y, heights]), indices=owner)
     in_plan = np.zeros(len(lines), bool)
     in_plan[owner[np.isnan(heights)]] = True
@@ -137,14 +168,7 @@ def _lines(ways: OsmWays, path: str | PathLike[str], owner: NDArray[np.int64], c
 
 
 def _split_at_junctions(ways: OsmWays, target: CRS, path: str | PathLike[str]) -> RoadGraph:
-    """Cut ways at the nodes they share, and keep the parts whose every node is in the file."""
-    whole = np.ones(len(ways.ids), bool)
-    whole[ways.way[~ways.placed]] = False  # what lies outside of an extract is unknown
-    if not whole.all():
-        logger.warning("%s: %d ways reach beyond the extract and are left out", path, int((~whole).sum()))
-    if not whole.any():
-        raise InputError("no way has its nodes in the file", where=path, fix="make the extract with complete ways")
-    ways = ways.select_ways(whole)
+    """Cut ways at the nodes they share."""
     parts = split_at_shared_nodes(ways)
     lines = _lines(ways.select_vertices(parts.vertex), path, parts.part, target)
     tags = ways.tag_table([*_KEPT_TAGS, *DIRECTION_TAGS])
@@ -169,7 +193,8 @@ def _restored(ways: OsmWays, target: CRS, path: str | PathLike[str]) -> RoadGrap
     lines = _lines(ways, path, ways.way, target)
     keys = dict.fromkeys(key for tags in ways.tags for key in tags if key.startswith(_PREFIX))
     ours = ways.tag_table(keys).rename(columns=lambda name: name.removeprefix(_PREFIX))
-    table = gpd.GeoDataFrame(ours.apply(typed_column), geometry=lines, crs=target)
+    with parsing(path, "the tags of its ways are damaged", fix="write it again"):
+        table = gpd.GeoDataFrame(ours.apply(typed_column), geometry=lines, crs=target)
     if not set(OWN_COLUMNS) <= set(table):
         table = table.reindex(columns=[*OWN_COLUMNS, "geometry"])
     return graph_from_edge_table(table, where=path)

@@ -11,8 +11,11 @@ takes longer to fill than the nodes of a city take to read.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager
+import bz2
+import gzip
+import re
+from collections.abc import Collection, Iterable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
@@ -23,12 +26,13 @@ import pandas as pd
 from numpy.typing import NDArray
 from osmium.filter import KeyFilter, TagFilter
 
-from probe2road.errors import InputError, Probe2RoadError
+from probe2road.io.guard import parsing
 
 __all__ = [
     "OsmWays",
     "WayParts",
     "osm_errors",
+    "placed_parts",
     "read_heights",
     "read_restrictions",
     "read_ways",
@@ -37,6 +41,9 @@ __all__ = [
 
 
 _PER_DEGREE = 10_000_000  # OpenStreetMap counts positions in whole multiples of 1e-7 degrees
+_BLOCK, _LONGEST_TAG = 1 << 22, 4096  # bytes of a file read at once, and of the longest start tag of a way
+_DELETED_WAY = re.compile(rb"""<way\s[^<>]*?\baction=['"]delete['"][^<>]*>""")
+_ID = re.compile(rb"""\sid=['"](-?\d{1,18})['"]""")
 _NO_POSITION = 2_147_483_647  # what osmium has for a node that is not in the file
 
 
@@ -92,6 +99,30 @@ class OsmWays:
         return replace(inside, ids=self.ids[kept], tags=tags, way=(np.cumsum(kept) - 1)[inside.way])
 
 
+def placed_parts(ways: OsmWays) -> OsmWays:
+    """Cut ways at vertices without a position: what is drawn between two of them stays, with the id and the tags.
+
+    An extract that was cut at a line holds the nodes inside only. No chord joins where a way leaves and comes back.
+
+    Examples
+    --------
+    >>> out = np.array([9.0, 9.1, np.nan, 9.3, 9.4, np.nan, 9.6])
+    >>> ways = OsmWays(np.array([7]), [{}], np.zeros(7, int), np.arange(7), out, out)
+    >>> parts = placed_parts(ways)
+    >>> parts.ids.tolist(), parts.refs.tolist(), parts.way.tolist()
+    ([7, 7], [0, 1, 3, 4], [0, 0, 1, 1])
+    """
+    placed = ways.placed
+    if placed.all():
+        return ways
+    starts = placed & ((np.diff(ways.way, prepend=-1) != 0) | ~np.append(False, placed[:-1]))
+    part = np.cumsum(starts)[placed] - 1
+    inside = ways.select_vertices(placed)
+    of_way = inside.way[np.unique(part, return_index=True)[1]]
+    parts = replace(inside, ids=ways.ids[of_way], tags=[ways.tags[row] for row in of_way.tolist()], way=part)
+    return parts.select_ways(parts.n_nodes > 1)
+
+
 @dataclass(frozen=True)
 class WayParts:
     """Ways cut where they meet; a vertex at which a way is cut is drawn twice.
@@ -112,22 +143,9 @@ class WayParts:
     last: NDArray[np.int64]
 
 
-@contextmanager
-def osm_errors(path: str | PathLike[str]) -> Iterator[None]:
-    """Turn the errors of osmium, which are RuntimeErrors and ValueErrors, into ours.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
-    try:
-        yield
-    except Probe2RoadError:
-        raise  # ours are ValueErrors, too
-    except (RuntimeError, ValueError) as error:
-        fault = f"cannot be read as OSM data ({error})"
-        raise InputError(fault, where=path, fix="check that it is complete") from error
+def osm_errors(path: str | PathLike[str]) -> AbstractContextManager[None]:
+    """Turn the errors of osmium into ours; see `probe2road.io.guard.parsing`."""
+    return parsing(path, "cannot be read as OSM data")
 
 
 def read_ways(path: str | PathLike[str], highways: Collection[str] | None) -> OsmWays:
@@ -154,6 +172,8 @@ def read_ways(path: str | PathLike[str], highways: Collection[str] | None) -> Os
         positions = _positions(path)
         for item in osmium.FileProcessor(str(path), osmium.osm.WAY).with_filter(wanted).with_filter(positions):
             way: Any = item
+            if way.deleted or not way.visible:
+                continue
             ids.append(way.id)
             tags.append(dict(way.tags))
             n_nodes.append(len(way.nodes))
@@ -164,7 +184,46 @@ def read_ways(path: str | PathLike[str], highways: Collection[str] | None) -> Os
     lon, lat = (np.where(np.array(part) == _NO_POSITION, np.nan, np.array(part) / _PER_DEGREE) for part in (x, y))
     way_of_vertex = np.repeat(np.arange(len(ids)), n_nodes)
     ways = OsmWays(np.array(ids, np.int64), tags, way_of_vertex, np.array(refs, np.int64), lon, lat)
-    return _with_new_nodes(ways, path)
+    ways = _with_inline_positions(_with_new_nodes(ways, path), path, wanted)
+    deleted = _marked_for_deletion(path)
+    return ways.select_ways(~np.isin(ways.ids, list(deleted))) if deleted else ways
+
+
+def _with_inline_positions(ways: OsmWays, path: str | PathLike[str], wanted: Any) -> OsmWays:
+    """Fill in positions that stand at the references of ways, as ``out geom`` of Overpass and osmium write them."""
+    if ways.placed.all():
+        return ways
+    x, y = [], []
+    with osm_errors(path):
+        for item in osmium.FileProcessor(str(path), osmium.osm.WAY).with_filter(wanted):
+            way: Any = item
+            if way.deleted or not way.visible:
+                continue
+            for node in way.nodes:
+                x.append(node.x)
+                y.append(node.y)
+    lon, lat = (np.where(np.array(part) == _NO_POSITION, np.nan, np.array(part) / _PER_DEGREE) for part in (x, y))
+    placed = ways.placed
+    return replace(ways, lon=np.where(placed, ways.lon, lon), lat=np.where(placed, ways.lat, lat))
+
+
+def _marked_for_deletion(path: str | PathLike[str]) -> set[int]:
+    """Return the ids of ways that JOSM has marked for deletion in a file, which osmium does not see."""
+    name = str(path).lower()
+    opened = {".osm": open, ".gz": gzip.open, ".bz2": bz2.open}
+    opener: Any = next((opener for suffix, opener in opened.items() if name.endswith(suffix)), None)
+    if opener is None:
+        return set()
+    found: set[int] = set()
+    with osm_errors(path), opener(path, "rb") as file:
+        rest = b""
+        while block := file.read(_BLOCK):
+            text = rest + block
+            for tag in _DELETED_WAY.finditer(text):
+                if ident := _ID.search(tag[0]):
+                    found.add(int(ident[1]))
+            rest = text[-_LONGEST_TAG:]  # a tag may go on in the next block; ids are collected once
+    return found
 
 
 def _positions(path: str | PathLike[str]) -> osmium.NodeLocationsForWays:

@@ -1,0 +1,83 @@
+"""The gate at which the errors of other libraries become ours.
+
+A damaged file can make GDAL, Arrow, osmium, expat, PROJ and pandas raise nearly anything. What parses a file stands
+under `parsing`; what is made of its content is validated, so that a defect of ours stays visible as one.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from probe2road.errors import InputError, Probe2RoadError
+
+__all__ = ["located", "parsing"]
+
+_LONGEST = 200  # characters of a foreign message that are of use
+
+
+@contextmanager
+def parsing(where: object, what: str, *, fix: str = "check that it is complete") -> Iterator[None]:
+    """Turn any error of another library in the block into one that names the file.
+
+    Only for blocks that call parsers and convert what they gave. Warnings of the parsers are silenced: what they warn
+    of is checked afterwards.
+
+    Parameters
+    ----------
+    where
+        The file.
+    what
+        What went wrong, such as ``cannot be read as GraphML``.
+    fix
+        What the user can do.
+
+    Raises
+    ------
+    InputError
+        In the place of an error that is not ours.
+
+    Examples
+    --------
+    >>> with parsing("roads.graphml", "cannot be read as GraphML"):
+    ...     int("seven")
+    Traceback (most recent call last):
+        ...
+    probe2road.errors.InputError: roads.graphml: cannot be read as GraphML (invalid literal for int() ...); check ...
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except Probe2RoadError:
+        raise
+    except Exception as error:
+        raise InputError(f"{what} ({_short(error)})", where=where, fix=fix) from error
+
+
+@contextmanager
+def located(where: object) -> Iterator[None]:
+    """Name the file in errors of ours that name no place, such as one about the CRS of what it holds.
+
+    Examples
+    --------
+    >>> with located("roads.osm"):
+    ...     raise InputError("no position", fix="check that it is complete")
+    Traceback (most recent call last):
+        ...
+    probe2road.errors.InputError: roads.osm: no position; check that it is complete
+    """
+    try:
+        yield
+    except Probe2RoadError as error:
+        if error.where is not None:
+            raise
+        raise type(error)(error.what, where=where, fix=error.fix) from error
+
+
+def _short(error: Exception) -> str:
+    """Return the first line of a message, cut where it becomes useless; the kind of error where there is none."""
+    lines = str(error).strip().splitlines()
+    text = lines[0] if lines else type(error).__name__
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
