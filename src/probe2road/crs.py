@@ -40,6 +40,7 @@ WGS84 = CRS.from_epsg(4326)
 _UTM_ZONE_WIDTH = 6.0  # degrees of longitude
 _UTM_ZONE_OVERHANG = 0.5  # degrees a data set may reach into the next zone and still use this one
 _SCALE_TOLERANCE = 2e-3  # of a projection that may stay the CRS of a run
+_WANTED_TOLERANCE = 1e-2  # of one that the user names: a neighbouring UTM zone is fine
 _NORTH_DEGREES, _NORTH_METRES = 1e-4, 10.0  # how far north a place is looked at to find where north is
 _UTM_LATITUDES = (-80.0, 84.0)  # degrees; outside, UTM is not defined
 
@@ -144,8 +145,8 @@ def require_metric(crs: CRS | None, *, where: object = None) -> CRS:
     return crs
 
 
-def is_true_to_scale(crs: CRS, lon: ArrayLike, lat: ArrayLike) -> bool:
-    """Say whether a metre of a projected CRS is a metre on the ground, to two parts per thousand, at positions.
+def is_true_to_scale(crs: CRS, lon: ArrayLike, lat: ArrayLike, *, tolerance: float = _SCALE_TOLERANCE) -> bool:
+    """Say whether a metre of a projected CRS is a metre on the ground, by default to two per thousand, at positions.
 
     Two per thousand is what a UTM zone shows half a zone beside its edge. Web Mercator fails away from the
     equator, where its metre is short by the cosine of the latitude.
@@ -159,7 +160,7 @@ def is_true_to_scale(crs: CRS, lon: ArrayLike, lat: ArrayLike) -> bool:
     """
     factors = Proj(crs).get_factors(np.asarray(lon, np.float64), np.asarray(lat, np.float64))
     scales = np.concatenate([np.ravel(factors.meridional_scale), np.ravel(factors.parallel_scale)])
-    return bool((np.abs(scales - 1.0) <= _SCALE_TOLERANCE).all())
+    return bool((np.abs(scales - 1.0) <= tolerance).all())
 
 
 def working_crs(
@@ -174,7 +175,7 @@ def working_crs(
     x, y
         Positions; the extremes are enough.
     target_crs
-        What the user wants; it must be true to scale where the data lies.
+        What the user wants; it must be true to scale to a hundredth where the data lies.
     own
         Whether a graph of ours comes back: it keeps the CRS in which it was made.
     where
@@ -213,7 +214,7 @@ def working_crs(
         raise CRSError(f"coordinates lie outside of {source.name}", where=where, fix=fix)
     if target_crs is not None:
         target = require_metric(parse_crs(target_crs, where=where), where=where)
-        if not own and lon.size and not is_true_to_scale(target, lon, lat):
+        if not own and lon.size and not is_true_to_scale(target, lon, lat, tolerance=_WANTED_TOLERANCE):
             fix = f'name another, for example target_crs="{crs_to_text(local_crs(lon, lat))}", or none'
             raise CRSError(f"a metre of {target.name} is no metre on the ground here", where=where, fix=fix)
         return target

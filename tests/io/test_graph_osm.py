@@ -54,7 +54,7 @@ def test_ways_are_split_where_they_share_a_node_and_bridges_pass_over(extract: P
 
 def test_ways_that_reach_beyond_the_extract_are_counted(extract: Path, caplog: pytest.LogCaptureFixture) -> None:
     read_graph(extract)
-    assert "1 ways reach beyond the extract and are left out" in caplog.text
+    assert "1 ways reach beyond the extract; the parts inside are kept, 1 have none" in caplog.text
 
 
 def test_the_classes_to_keep_can_be_chosen(extract: Path) -> None:
