@@ -245,10 +245,24 @@ def read(reader: str, path: Path) -> None:
         describe_graph(p2r.read_graph(path))
 
 
+def outcome_of(reader: str, path: Path) -> str:
+    """Return ``read``, ``refused``, or the exception that is not ours and where in our code it came up."""
+    from probe2road.errors import Probe2RoadError
+
+    try:
+        read(reader, path)
+    except Probe2RoadError:
+        return "refused"
+    except BaseException as error:
+        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "/probe2road/" in frame.filename]
+        place = f"{Path(frames[-1].filename).stem}.{frames[-1].name}" if frames else "outside"
+        return f"{type(error).__name__} in {place}"
+    return "read"
+
+
 def _serve(connection: Connection, memory: int) -> None:
     """Read what is asked for, one file after the other; runs in a process of its own."""
     import probe2road as p2r
-    from probe2road.errors import Probe2RoadError
 
     logging.disable(logging.CRITICAL)
     warnings.simplefilter("ignore")
@@ -258,15 +272,7 @@ def _serve(connection: Connection, memory: int) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (used + memory, used + memory))
     while True:
         reader, path = connection.recv()
-        try:
-            read(reader, path)
-            connection.send("read")
-        except Probe2RoadError:
-            connection.send("refused")
-        except BaseException as error:
-            frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "probe2road" in frame.filename]
-            place = f"{Path(frames[-1].filename).stem}.{frames[-1].name}" if frames else "outside"
-            connection.send(f"{type(error).__name__} in {place}")
+        connection.send(outcome_of(reader, path))
 
 
 class Worker:
