@@ -54,6 +54,7 @@ def read_or_refused(path: Path) -> None:
         ("UPDATE nodes SET node = 'x'", "node ids are not unique"),
         ("UPDATE edges SET u = NULL", "the columns of the edges are damaged"),
         ("UPDATE edges SET geom = NULL WHERE edge = 1", "1 edges are no LineString (first: row 1)"),
+        ("UPDATE nodes SET geom = NULL WHERE node = 1", "1 nodes are no Point (first: row 1)"),
         ("UPDATE turns SET from_edge = 'x'", None),
         ("UPDATE gpkg_spatial_ref_sys SET definition = 'undefined'", None),
         ("DROP TABLE nodes", None),

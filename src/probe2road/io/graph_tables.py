@@ -40,6 +40,7 @@ __all__ = [
     "projected",
     "require_finite",
     "require_lines",
+    "require_points",
     "text_value",
     "typed_column",
 ]
@@ -172,6 +173,7 @@ def graph_from_edge_table(
     else:
         with parsing(where, "the table of the nodes is damaged", fix="write it again"):
             nodes = nodes.astype({"node": "int64"}).set_index("node").sort_index()
+        require_points(nodes, where=where)
     graph = RoadGraph(nodes, edges, turns)
     require_sound(graph, where=where)
     return graph
@@ -194,6 +196,15 @@ def require_lines(table: gpd.GeoDataFrame, *, where: object) -> None:
         fault = f"{int((~line).sum())} edges are no LineString (first: row {np.flatnonzero(~line)[0]})"
         raise InputError(fault, where=where, fix="write it again")
     require_finite(table, where=where)
+
+
+def require_points(nodes: gpd.GeoDataFrame, *, where: object) -> None:
+    """Refuse a table of our nodes in which one has no place."""
+    geometry = nodes.geometry.to_numpy()
+    point = (shapely.get_type_id(geometry) == shapely.GeometryType.POINT) & ~shapely.is_empty(geometry)
+    if not point.all():
+        fault = f"{int((~point).sum())} nodes are no Point (first: row {np.flatnonzero(~point)[0]})"
+        raise InputError(fault, where=where, fix="write it again")
 
 
 def projected(table: Any, target: CRS, *, where: object) -> gpd.GeoDataFrame:
