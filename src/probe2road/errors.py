@@ -28,8 +28,23 @@ __all__ = [
 ]
 
 
+_LONGEST_LINE = 480  # characters of a line of a message: some lines of a terminal
+_MOST_LINES = 40
+
+
+def _shortened(text: str) -> str:
+    """Cut what is long out of the middle of lines, and lines out of the end: a list of names may have any length."""
+    lines = text.split("\n")
+    if len(lines) > _MOST_LINES:
+        lines = [*lines[:_MOST_LINES], f"  and {len(lines) - _MOST_LINES} more lines"]
+    head, tail = _LONGEST_LINE * 2 // 3, _LONGEST_LINE // 3
+    return "\n".join(line if len(line) <= _LONGEST_LINE else f"{line[:head]} [...] {line[-tail:]}" for line in lines)
+
+
 class Probe2RoadError(Exception):
     """Base of every error that probe2road raises on purpose.
+
+    Messages are cut at some hundred characters a line, whatever the data put into them.
 
     Parameters
     ----------
@@ -47,6 +62,7 @@ class Probe2RoadError(Exception):
     """
 
     def __init__(self, what: str, *, where: object = None, fix: str | None = None) -> None:
+        what, fix = _shortened(what), None if fix is None else _shortened(fix)
         self.what, self.where, self.fix = what, where, fix
         prefix = "" if where is None else f"{where}: "
         suffix = "" if fix is None else f"; {fix}"

@@ -21,7 +21,6 @@ from probe2road.fleet.tables import (
     POINT_KINDS,
     check_points,
     check_traces,
-    clock_faults,
     empty_points,
     run_starts,
     sort_fixes,
@@ -376,15 +375,15 @@ def fleet_from_checked(
     points_crs: CRS,
     target_crs: Any = None,
     outliers: OutlierOptions | None = None,
+    invalid: str | None = "refuse",
     where: object = None,
 ) -> Fleet:
     """Sort and project tables that `check_traces` and `check_points` have passed; see `fleet_from_tables`.
 
     For readers, which check file by file so that a fault names its file.
     """
-    faults = clock_faults(traces)
-    if not faults:
-        traces = sort_fixes(traces, crs, faults)
+    faults: list[str] = []
+    traces = sort_fixes(traces, crs, faults, invalid=invalid)
     if faults:
         raise InputError.from_faults(faults, where=where)
     traces = without_impossible_fixes(traces, crs, options=outliers, where=where)

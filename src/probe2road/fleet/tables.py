@@ -7,7 +7,7 @@ fault. What can be repaired without losing information (row order, exact duplica
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +19,7 @@ from pyproj import CRS
 from probe2road.crs import WGS84, transform
 
 __all__ = [
+    "MISSING_WORDS",
     "POINT_COLUMNS",
     "POINT_KINDS",
     "POINT_OPTIONAL_COLUMNS",
@@ -28,8 +29,8 @@ __all__ = [
     "TableOrigin",
     "check_points",
     "check_traces",
-    "clock_faults",
     "empty_points",
+    "may_leave_out",
     "run_starts",
     "sort_fixes",
 ]
@@ -43,11 +44,18 @@ POINT_COLUMNS = ("trace_id", "t", "x", "y", "z", "kind")
 POINT_OPTIONAL_COLUMNS = ("accuracy",)
 TIME_DTYPE = "datetime64[ns, UTC]"
 
+# What databases and spreadsheets write where there is nothing, in lower case.
+MISSING_WORDS = ("", "nan", "null", "none", "na", "n/a", "nat", "<na>", "\\n", "-", "--", "?")
+
 _MAY_BE_ABSENT = ("t", "z")  # data without clock, 2-D data
+_SHARE_LEFT_OUT = 0.05  # of the rows of a file that may be left out unasked
 _EXAMPLES_SHOWN = 3  # offending rows named in a fault
+_MOST_SECONDS = 9.2e9  # since 1970; a time in nanoseconds holds no more
+_FIRST_TIME, _LAST_TIME = (limit.tz_localize("UTC") for limit in (pd.Timestamp(1678, 1, 1), pd.Timestamp(2262, 1, 1)))
 _SAME_PLACE = 0.01  # m; repeated fixes at one instant nearer than this are one fix
 _DEGREES_PER_METRE = 1e-5  # of latitude, rounded up
 _POLAR = 80.0  # degrees of latitude beyond which swapped columns are likelier than roads
+_SWAPPED = "; longitude and latitude look swapped"
 _SPREAD_OF_DEGREES = 5.0  # a projected data set that spans less than this near the origin is in degrees
 _FAR_FROM_CRS = 20.0  # degrees outside the area of use of a CRS, beyond which the CRS is wrong
 
@@ -60,6 +68,7 @@ class TableOrigin:
     row_word: str = "row"  # "line" for text files
     first_row: int = 0  # number of the table's first row in those words
     columns: Mapping[str, str] = field(default_factory=dict)  # our column name -> the author's
+    by_name: Collection[str] = ()  # our columns that were taken for their usual names alone, not named by the user
 
     def column(self, ours: str) -> str:
         """Return how to call one of our columns in a message."""
@@ -76,8 +85,44 @@ class TableOrigin:
         return f"{len(rows)} of {len(mask)} rows ({shown}{', ...' if len(rows) > _EXAMPLES_SHOWN else ''})"
 
 
+class _Checks:
+    """What is found wrong with one table: faults of it all, and rows that could be left out."""
+
+    def __init__(self, origin: TableOrigin, faults: list[str]) -> None:
+        self.origin, self.faults = origin, faults
+        self.rows: list[tuple[str, NDArray[np.bool_]]] = []
+
+    def name(self, ours: str) -> str:
+        """Return how to call a column at the start of a fault."""
+        return f"{self.origin.name}: column {self.origin.column(ours)}"
+
+    def fault(self, fault: str) -> None:
+        """Note what is wrong with the table."""
+        self.faults.append(fault)
+
+    def row_fault(self, fault: str, mask: NDArray[np.bool_]) -> None:
+        """Note what is wrong with some rows."""
+        self.rows.append((fault, mask))
+
+
+def may_leave_out(n_bad: int, n_rows: int, invalid: str | None) -> bool:
+    """Say whether bad rows are left out: ``"drop"``, ``"refuse"``, or None for up to 5 % of them.
+
+    Examples
+    --------
+    >>> may_leave_out(5, 100, None), may_leave_out(6, 100, None), may_leave_out(6, 100, "drop")
+    (True, False, True)
+    """
+    return invalid == "drop" or (invalid is None and n_bad <= _SHARE_LEFT_OUT * n_rows)
+
+
 def check_traces(
-    table: pd.DataFrame, crs: CRS, faults: list[str], *, origin: TableOrigin | None = None
+    table: pd.DataFrame,
+    crs: CRS,
+    faults: list[str],
+    *,
+    origin: TableOrigin | None = None,
+    invalid: str | None = "refuse",
 ) -> pd.DataFrame:
     """Return the traces' known columns in canonical types, adding what is wrong with them to the faults.
 
@@ -91,11 +136,15 @@ def check_traces(
         List that the faults are appended to; if any are, the table returned is not to be used.
     origin
         Names for the messages.
+    invalid
+        What happens to rows without position, trace id or readable time: ``"drop"`` leaves them out with a warning,
+        ``"refuse"`` makes them faults, None leaves out up to 5 % of the rows.
 
     Returns
     -------
     DataFrame
-        `TRACE_COLUMNS`, then those of `TRACE_OPTIONAL_COLUMNS` that the table has, in the same row order.
+        `TRACE_COLUMNS`, then those of `TRACE_OPTIONAL_COLUMNS` that the table has, in the same row order. The index
+        has the row numbers of the table given.
 
     Examples
     --------
@@ -105,15 +154,20 @@ def check_traces(
     ["traces: column 'trace_id' is missing (there are: x, y)"]
     """
     origin = origin or TableOrigin("traces")
-    return _checked(table, origin, (TRACE_COLUMNS, TRACE_OPTIONAL_COLUMNS), crs, faults)
+    return _checked(table, origin, (TRACE_COLUMNS, TRACE_OPTIONAL_COLUMNS), crs, faults, invalid)
 
 
 def check_points(
-    table: pd.DataFrame, crs: CRS, faults: list[str], *, origin: TableOrigin | None = None
+    table: pd.DataFrame,
+    crs: CRS,
+    faults: list[str],
+    *,
+    origin: TableOrigin | None = None,
+    invalid: str | None = "refuse",
 ) -> pd.DataFrame:
     """Return the semantic points' known columns in canonical types; see `check_traces`."""
     origin = origin or TableOrigin("points")
-    return _checked(table, origin, (POINT_COLUMNS, POINT_OPTIONAL_COLUMNS), crs, faults)
+    return _checked(table, origin, (POINT_COLUMNS, POINT_OPTIONAL_COLUMNS), crs, faults, invalid)
 
 
 def empty_points(trace_ids: pd.Series) -> pd.DataFrame:
@@ -123,22 +177,11 @@ def empty_points(trace_ids: pd.Series) -> pd.DataFrame:
     return pd.DataFrame({"trace_id": trace_ids.iloc[:0], "t": pd.Series(dtype=TIME_DTYPE), **columns, "kind": kind})
 
 
-def clock_faults(traces: pd.DataFrame) -> list[str]:
-    """Name traces in which some fixes have a time and others have none."""
-    untimed = traces["t"].isna()
-    if not untimed.any() or untimed.all():
-        return []
-    partly = untimed.groupby(traces["trace_id"], sort=False).mean()
-    partly = partly[(partly > 0) & (partly < 1)]
-    if partly.empty:
-        return []
-    return [f"traces: some fixes of {len(partly)} traces have no time ({_few(partly.index)}); drop those fixes"]
+def sort_fixes(traces: pd.DataFrame, crs: CRS, faults: list[str], *, invalid: str | None = "refuse") -> pd.DataFrame:
+    """Sort by trace and time and drop repeated fixes; what no clock can order is a fault, or left out.
 
-
-def sort_fixes(traces: pd.DataFrame, crs: CRS, faults: list[str]) -> pd.DataFrame:
-    """Sort by trace and time and drop repeated fixes; repeated fixes that disagree are a fault.
-
-    Rows without time keep their order. A table that is in order already is returned as it is.
+    Those are fixes that repeat the time of the fix before at another place, and fixes without time in a trace that
+    has times. Rows without time keep their order. A table that is in order already is returned as it is.
 
     Examples
     --------
@@ -146,6 +189,9 @@ def sort_fixes(traces: pd.DataFrame, crs: CRS, faults: list[str]) -> pd.DataFram
     >>> sort_fixes(table, CRS.from_epsg(32616), [])["t"].dt.second.tolist()
     [1, 2]
     """
+    traces = _with_whole_clocks(traces, faults, invalid)
+    if faults:
+        return traces
     codes = _codes(traces["trace_id"])
     time = traces["t"].to_numpy(dtype="datetime64[ns]").view(np.int64)  # NaT is the smallest integer: all alike
     same_trace, later = np.diff(codes) == 0, np.diff(time) >= 0
@@ -162,12 +208,17 @@ def sort_fixes(traces: pd.DataFrame, crs: CRS, faults: list[str]) -> pd.DataFram
     apart = np.hypot(*(np.diff(traces[axis].to_numpy(), prepend=np.nan) for axis in "xy"))
     disagree = repeated & (apart > _SAME_PLACE * (_DEGREES_PER_METRE if crs.is_geographic else 1.0))
     if disagree.any():
-        faults.append(
-            f"traces: {int(disagree.sum())} fixes repeat the time of the fix before at another place "
-            f"(trace {_few(traces['trace_id'][disagree].unique())}); use finer time stamps, or one trace_id per drive"
+        what = (
+            f"{int(disagree.sum())} fixes repeat the time of the fix before at another place "
+            f"(trace {_few(traces['trace_id'][disagree].unique())})"
         )
-        return traces
-    logger.warning("dropped %d repeated fixes", int(repeated.sum()))
+        if not may_leave_out(int(disagree.sum()), len(traces), invalid):
+            fix = 'use finer time stamps, or one trace_id per drive, or leave the later ones out with invalid="drop"'
+            faults.append(f"traces: {what}; {fix}")
+            return traces
+        logger.warning("%s: left out", what)
+    if n_same := int(repeated.sum() - disagree.sum()):
+        logger.warning("dropped %d repeated fixes", n_same)
     return traces[~repeated].reset_index(drop=True)
 
 
@@ -188,12 +239,31 @@ def run_starts(ids: pd.Series) -> NDArray[np.int64]:
     return np.concatenate([[0], changes, [len(ids)]]).astype(np.int64)
 
 
+def _with_whole_clocks(traces: pd.DataFrame, faults: list[str], invalid: str | None) -> pd.DataFrame:
+    """Leave out fixes without time of traces that have times, or name those traces."""
+    untimed = traces["t"].isna()
+    if not untimed.any() or untimed.all():
+        return traces
+    partly = untimed.groupby(traces["trace_id"], sort=False).mean()
+    partly = partly[(partly > 0) & (partly < 1)]
+    if partly.empty:
+        return traces
+    bad = (untimed & traces["trace_id"].isin(partly.index)).to_numpy(bool)
+    what = f"{int(bad.sum())} fixes of {len(partly)} traces have no time ({_few(partly.index)})"
+    if not may_leave_out(int(bad.sum()), len(traces), invalid):
+        faults.append(f'traces: some fixes have no time: {what}; drop those fixes, for example with invalid="drop"')
+        return traces
+    logger.warning("%s: left out", what)
+    return traces[~bad].reset_index(drop=True)
+
+
 def _checked(
     table: pd.DataFrame,
     origin: TableOrigin,
     columns: tuple[Sequence[str], Sequence[str]],
     crs: CRS,
     faults: list[str],
+    invalid: str | None,
 ) -> pd.DataFrame:
     """Check one table of the given columns (always present, optional)."""
     needed, optional = columns
@@ -205,31 +275,65 @@ def _checked(
         faults.append(f"{origin.name}: no rows")
     if len(faults) > known:
         return table
-    result: dict[str, Any] = {"trace_id": _identifiers(table["trace_id"], origin, faults)}
-    result["t"] = _timestamps(table["t"], origin, faults) if "t" in table else _no_times(len(table))
+    checks = _Checks(origin, faults)
+    result: dict[str, Any] = {"trace_id": _identifiers(table["trace_id"], checks)}
+    result["t"] = _timestamps(table["t"], checks) if "t" in table else _no_times(len(table))
     for name in ("x", "y", "z", *optional):
         if name not in table:
             if name in needed:
                 result[name] = np.full(len(table), np.nan)
         elif name == "vehicle_id":
             result[name] = table[name].array
+        elif name in ("x", "y"):
+            result[name] = _coordinates(table[name], checks)
         else:
-            result[name] = _numbers(table[name], origin, faults, must_be_finite=name in ("x", "y"))
+            values = _measured(table[name], checks, invalid)
+            if values is not None or name in needed:
+                result[name] = np.full(len(table), np.nan) if values is None else values
     if "kind" in needed:
-        result["kind"] = _kinds(table["kind"], origin, faults)
+        result["kind"] = _kinds(table["kind"], checks)
+    if crs.is_geographic and len(faults) == known:
+        _degree_faults(result["x"], result["y"], checks)
+    keep = _rows_to_keep(len(table), checks, invalid, complain=len(faults) == known)
+    checked = pd.DataFrame(result, copy=False)
+    if len(faults) == known and not keep.all():
+        checked = checked[keep]
     if len(faults) == known:
-        faults += [f"{origin.name}: {fault}" for fault in _position_faults(result["x"], result["y"], crs, origin)]
-    return pd.DataFrame(result, copy=False)
+        x, y = checked["x"].to_numpy(), checked["y"].to_numpy()
+        found = _polar_faults(x, y) if crs.is_geographic else _metre_faults(x, y, crs)
+        faults += [f"{origin.name}: {fault}" for fault in found]
+    return checked
 
 
-def _identifiers(ids: pd.Series, origin: TableOrigin, faults: list[str]) -> Any:
+def _rows_to_keep(n: int, checks: _Checks, invalid: str | None, *, complain: bool) -> NDArray[np.bool_]:
+    """Mark the rows that are not left out; where too many would be, what is wrong with them becomes a fault."""
+    keep = np.ones(n, bool)
+    for _, mask in checks.rows:
+        keep &= ~mask
+    n_bad = int(n - keep.sum())
+    if n_bad == 0:
+        return keep
+    if n_bad < n and may_leave_out(n_bad, n, invalid):
+        if complain:
+            for fault, _ in checks.rows:
+                logger.warning("%s: left out", fault)
+        return keep
+    all_bad = f"all {n} rows are bad" if n_bad == n else ""
+    remedy = "" if n_bad == n or not complain else '; leave such rows out with invalid="drop"'
+    checks.faults += [f"{fault}{remedy}" for fault, _ in checks.rows]
+    if all_bad and len(checks.rows) > 1:
+        checks.fault(f"{checks.origin.name}: {all_bad}")
+    return np.ones(n, bool)
+
+
+def _identifiers(ids: pd.Series, checks: _Checks) -> Any:
     """Check trace ids for holes, and bring mixed types and bytes to text, so that they sort."""
-    name = f"{origin.name}: column {origin.column('trace_id')}"
+    name = checks.name("trace_id")
     empty = ids.isna().to_numpy()
     if pd.api.types.is_string_dtype(ids.dtype) and not pd.api.types.is_object_dtype(ids.dtype):
         empty = empty | (ids == "").to_numpy(bool, na_value=False)
     if empty.any():
-        faults.append(f"{name} is empty in {int(empty.sum())} of {len(ids)} rows")
+        checks.row_fault(f"{name} is empty in {int(empty.sum())} of {len(ids)} rows", empty)
     if isinstance(ids.dtype, pd.CategoricalDtype) and not empty.any():
         ids = ids.astype(ids.cat.categories.dtype)
     if not pd.api.types.is_object_dtype(ids.dtype):
@@ -237,60 +341,109 @@ def _identifiers(ids: pd.Series, origin: TableOrigin, faults: list[str]) -> Any:
     try:
         codes, found = pd.factorize(ids)
     except TypeError:  # lists and the like
-        faults.append(f"{name} holds neither text nor numbers")
+        checks.fault(f"{name} holds neither text nor numbers")
         return ids.array
     words = [value.hex() if isinstance(value, bytes) else str(value) for value in found]
     return pd.array([*words, None], dtype="str").take(codes)
 
 
-def _numbers(values: pd.Series, origin: TableOrigin, faults: list[str], *, must_be_finite: bool) -> NDArray[np.float64]:
-    """Convert a column to float64, or name the cells that prevent it."""
-    name = f"{origin.name}: column {origin.column(str(values.name))}"
-    if _is_plain_numeric(values):
-        numbers = values.to_numpy(dtype=np.float64, na_value=np.nan)
-    elif values.dtype.kind in "bmM":
-        faults.append(f"{name} holds {values.dtype}, not numbers")
+def _coordinates(values: pd.Series, checks: _Checks) -> NDArray[np.float64]:
+    """Convert a column of coordinates to float64; rows without one are bad."""
+    name = checks.name(str(values.name))
+    if not _may_hold_numbers(values):
+        checks.fault(f"{name} holds {values.dtype}, not numbers")
         return np.full(len(values), np.nan)
-    else:
-        words = values.astype(object).map(str, na_action="ignore").str.strip()
-        numbers = pd.to_numeric(words, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
-        not_numeric = np.isnan(numbers) & ~(words.isna() | words.str.lower().isin(["", "nan"])).to_numpy(bool)
-        if not_numeric.any():
-            comma = words[not_numeric].str.fullmatch(r"[+-]?\d+,\d+").all()
-            hint = "; decimal commas are not read, use points" if comma else ""
-            faults.append(f"{name} is not a number in {origin.rows(not_numeric, words)}{hint}")
-            return numbers
-    if must_be_finite and not np.isfinite(numbers).all():
-        faults.append(f"{name} is empty or not finite in {origin.rows(~np.isfinite(numbers), numbers)}")
+    numbers, words, unreadable = _numbers(values)
+    if unreadable.any():
+        comma = words[unreadable].str.fullmatch(r"[+-]?\d+,\d+").all()
+        hint = "; decimal commas are not read, use points" if comma else ""
+        checks.row_fault(f"{name} is not a number in {checks.origin.rows(unreadable, words)}{hint}", unreadable)
+    missing = ~np.isfinite(numbers) & ~unreadable
+    if missing.any():
+        checks.row_fault(f"{name} is empty or not finite in {checks.origin.rows(missing, numbers)}", missing)
     return numbers
+
+
+def _measured(values: pd.Series, checks: _Checks, invalid: str | None) -> NDArray[np.float64] | None:
+    """Convert a column that may be absent to float64; unreadable cells are unknown, None if it is to be left out."""
+    ours = str(values.name)
+    name, by_name = checks.name(ours), ours in checks.origin.by_name
+    remedy = f'leave the column out with {"point_" * (checks.origin.name == "points")}columns={{"{ours}": ""}}'
+    if not _may_hold_numbers(values):
+        fault = f"{name} holds {values.dtype}, not numbers"
+    else:
+        numbers, words, unreadable = _numbers(values)
+        if not unreadable.any():
+            return numbers
+        fault = f"{name} is not a number in {checks.origin.rows(unreadable, words)}"
+        if may_leave_out(int(unreadable.sum()), len(values), invalid):
+            logger.warning("%s: taken as unknown", fault)
+            return numbers
+    if by_name:
+        logger.warning("%s: the column is left out", fault)
+    else:
+        checks.fault(f"{fault}; {remedy}")
+    return None
+
+
+def _may_hold_numbers(values: pd.Series) -> bool:
+    """Say whether a column is of a type that numbers may be written in."""
+    return _is_plain_numeric(values) or values.dtype.kind not in "bmM"
+
+
+def _numbers(values: pd.Series) -> tuple[NDArray[np.float64], pd.Series, NDArray[np.bool_]]:
+    """Convert a column to float64: the numbers, the column as text, and where that is neither empty nor a number."""
+    if _is_plain_numeric(values):
+        return values.to_numpy(dtype=np.float64, na_value=np.nan), values, np.zeros(len(values), bool)
+    words = values.astype(object).map(str, na_action="ignore").str.strip()
+    numbers = pd.to_numeric(words, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
+    missing = (words.isna() | words.str.lower().isin(MISSING_WORDS)).to_numpy(bool)
+    return numbers, words, np.isnan(numbers) & ~missing
 
 
 def _is_plain_numeric(values: pd.Series) -> bool:
     return bool(pd.api.types.is_numeric_dtype(values.dtype) and values.dtype.kind != "b")
 
 
-def _timestamps(values: pd.Series, origin: TableOrigin, faults: list[str]) -> pd.Series:
+def _timestamps(values: pd.Series, checks: _Checks) -> pd.Series:
     """Convert a column to UTC timestamps: numbers are seconds since 1970, text is ISO 8601, naive is UTC."""
-    name = f"{origin.name}: column {origin.column('t')}"
+    name = checks.name("t")
     if values.dtype.kind in "bm":
-        faults.append(f"{name} holds {values.dtype}, not times")
+        checks.fault(f"{name} holds {values.dtype}, not times")
         return _no_times(len(values))
     if _is_plain_numeric(values):
-        seconds = values.to_numpy(dtype=np.float64, na_value=np.nan)
-        largest = float(np.nanmax(np.abs(seconds), initial=0.0))
-        if not largest < 9.2e9:
-            faults.append(f"{name} is not in seconds since 1970 (largest value {largest:.6g})")
-            return _no_times(len(values))
-        # A float64 holds the seconds of this century to a microsecond at best: do not invent nanoseconds.
-        microseconds = np.round(np.nan_to_num(seconds) * 1e6).astype(np.int64)
-        nanoseconds = np.where(np.isnan(seconds), np.iinfo(np.int64).min, microseconds * 1000)
-        return pd.Series(nanoseconds.view("datetime64[ns]")).dt.tz_localize("UTC")
+        return _times_of_seconds(values, checks)
     is_time = pd.api.types.is_datetime64_any_dtype(values.dtype)
+    if not is_time and not isinstance(values.dtype, pd.CategoricalDtype):
+        missing = values.isin([*MISSING_WORDS, "NULL", "\\N", "NaN", "None", "NA", "N/A"]).to_numpy(bool)
+        values = values.mask(missing) if missing.any() else values
     times = pd.to_datetime(values, utc=True, errors="coerce", format=None if is_time else "ISO8601")
     unreadable = (times.isna() & values.notna()).to_numpy()
     if unreadable.any():
-        faults.append(f"{name} is not a time in {origin.rows(unreadable, values)}; use ISO 8601 or seconds since 1970")
-    return times.astype(TIME_DTYPE).reset_index(drop=True)
+        rows = checks.origin.rows(unreadable, values)
+        checks.row_fault(f"{name} is not a time in {rows}; use ISO 8601 or seconds since 1970", unreadable)
+    times = times.reset_index(drop=True)
+    beyond = ((times < _FIRST_TIME) | (times > _LAST_TIME)).to_numpy(bool)
+    if beyond.any():
+        rows = checks.origin.rows(beyond, values)
+        checks.row_fault(f"{name} is outside the years {_FIRST_TIME.year}..{_LAST_TIME.year} in {rows}", beyond)
+        times = times.mask(beyond)
+    return times.astype(TIME_DTYPE)
+
+
+def _times_of_seconds(values: pd.Series, checks: _Checks) -> pd.Series:
+    """Convert seconds since 1970 to UTC timestamps; numbers too large for one are bad."""
+    seconds = values.to_numpy(dtype=np.float64, na_value=np.nan)
+    beyond = np.abs(seconds) >= _MOST_SECONDS
+    if beyond.any():
+        largest = float(np.nanmax(np.abs(seconds)))
+        name = f"{checks.name('t')} is not in seconds since 1970 (largest value {largest:.6g})"
+        checks.row_fault(f"{name} in {checks.origin.rows(beyond, seconds)}", beyond)
+        seconds = np.where(beyond, np.nan, seconds)
+    # A float64 holds the seconds of this century to a microsecond at best: do not invent nanoseconds.
+    microseconds = np.round(np.nan_to_num(seconds) * 1e6).astype(np.int64)
+    nanoseconds = np.where(np.isnan(seconds), np.iinfo(np.int64).min, microseconds * 1000)
+    return pd.Series(nanoseconds.view("datetime64[ns]")).dt.tz_localize("UTC")
 
 
 def _no_times(n: int) -> pd.Series:
@@ -298,43 +451,42 @@ def _no_times(n: int) -> pd.Series:
     return pd.Series(np.full(n, np.datetime64("NaT", "ns"))).dt.tz_localize("UTC")
 
 
-def _kinds(values: pd.Series, origin: TableOrigin, faults: list[str]) -> pd.Categorical:
+def _kinds(values: pd.Series, checks: _Checks) -> pd.Categorical:
     """Convert a column to the categories of semantic points, or name the values that are none."""
     codes, found = pd.factorize(values, use_na_sentinel=False)
     unknown = [str(kind) for kind in found if kind not in POINT_KINDS]
     if unknown:
-        name = f"{origin.name}: column {origin.column('kind')}"
-        faults.append(f"{name} is one of {', '.join(POINT_KINDS)}, not {_few(unknown)}")
+        checks.fault(f"{checks.name('kind')} is one of {', '.join(POINT_KINDS)}, not {_few(unknown)}")
     position = np.array([POINT_KINDS.index(kind) if kind in POINT_KINDS else -1 for kind in found], np.int8)
     return pd.Categorical.from_codes(position[codes], categories=POINT_KINDS)
 
 
-def _position_faults(x: NDArray[np.float64], y: NDArray[np.float64], crs: CRS, origin: TableOrigin) -> list[str]:
-    """Name positions that contradict the CRS, and say so where the two axes look swapped."""
-    return _degree_faults(x, y, origin) if crs.is_geographic else _metre_faults(x, y, crs)
-
-
-def _degree_faults(lon: NDArray[np.float64], lat: NDArray[np.float64], origin: TableOrigin) -> list[str]:
-    """Name longitudes and latitudes that are out of range or at a pole."""
-    bad_lon, bad_lat = np.abs(lon) > 180, np.abs(lat) > 90
-    middle = float(np.median(np.abs(lat)))
-    swapped = "; longitude and latitude look swapped" if middle > _POLAR and np.abs(lon).max() <= 90 else ""
+def _degree_faults(lon: NDArray[np.float64], lat: NDArray[np.float64], checks: _Checks) -> None:
+    """Note longitudes and latitudes that are out of range, and say so where the two axes look swapped."""
+    if not (np.isfinite(lon).any() and np.isfinite(lat).any()):
+        return
+    bad_lon, bad_lat = np.abs(lon) > 180, np.abs(lat) > 90  # such as 181 and 91: "not available" to many receivers
+    middle = float(np.nanmedian(np.abs(lat)))
+    swapped = _SWAPPED if middle > _POLAR and np.nanmax(np.abs(lon)) <= 90 else ""
     projected = (
         '; the values look projected: pass their CRS, for example crs="EPSG:32616"'
-        if max(np.abs(lon).max(), middle) > 1000
+        if max(np.nanmax(np.abs(lon)), middle) > 1000
         else ""
     )
-    faults = []
     for name, bad, limit, values in (("longitudes", bad_lon, 180, lon), ("latitudes", bad_lat, 90, lat)):
         if bad.any():
             hint = projected or (swapped if name == "latitudes" else "")
-            faults.append(f"{name} are outside -{limit}..{limit} in {origin.rows(bad, values)}{hint}")
-    if not faults and middle > _POLAR:
-        faults.append(
-            f"half of the latitudes are nearer to a pole than {_POLAR:.0f} degrees{swapped}; "
-            "if these drives are at a pole, pass them in a polar projection"
-        )
-    return faults
+            rows = checks.origin.rows(bad, values)
+            checks.row_fault(f"{checks.origin.name}: {name} are outside -{limit}..{limit} in {rows}{hint}", bad)
+
+
+def _polar_faults(lon: NDArray[np.float64], lat: NDArray[np.float64]) -> list[str]:
+    """Name latitudes that are at a pole, where the two axes are likelier swapped."""
+    if float(np.median(np.abs(lat))) <= _POLAR:
+        return []
+    swapped = _SWAPPED if np.abs(lon).max() <= 90 else ""
+    fault = f"half of the latitudes are nearer to a pole than {_POLAR:.0f} degrees{swapped}; "
+    return [fault + "if these drives are at a pole, pass them in a polar projection"]
 
 
 def _metre_faults(x: NDArray[np.float64], y: NDArray[np.float64], crs: CRS) -> list[str]:
