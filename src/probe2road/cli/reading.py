@@ -50,6 +50,9 @@ FLAGS: Mapping[str, str] = {
     "bbox": "--bbox",
     "delimiter": "--delimiter",
     "header": "--no-header",
+    "invalid": "--invalid",
+    "max_accuracy": "--max-accuracy",
+    "max_speed": "--max-speed",
     "layer": "--layer",
     "inner_junctions": "--no-inner-junctions",
     "segmenter": "--segmenter",
@@ -111,6 +114,21 @@ def fleet_options(
     trim_ends: Annotated[
         float | None, typer.Option(help="Metres to leave out at both ends of every trace.", rich_help_panel=_FLEET)
     ] = None,
+    invalid: Annotated[
+        str | None,
+        typer.Option(
+            help="Rows without position or readable time: drop or refuse; without it, dropped up to 5 % of a file.",
+            rich_help_panel=_FLEET,
+        ),
+    ] = None,
+    max_accuracy: Annotated[
+        float | None,
+        typer.Option(help="Leave out fixes that say that they are less accurate, m.", rich_help_panel=_FLEET),
+    ] = None,
+    max_speed: Annotated[
+        float | None,
+        typer.Option(help="Leave out fixes faster than this from their neighbours, m/s.", rich_help_panel=_FLEET),
+    ] = None,
 ) -> Said[FleetFormat]:
     """Return what is said of the files of a fleet."""
     from probe2road.io.formats import FleetFormat
@@ -124,6 +142,9 @@ def fleet_options(
         "delimiter": delimiter,
         "header": False if no_header else None,
         "trim_ends": trim_ends,
+        "invalid": invalid,
+        "max_accuracy": max_accuracy,
+        "max_speed": max_speed,
     }
     return Said(FleetFormat, "format", fields, FLAGS)
 

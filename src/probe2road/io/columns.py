@@ -7,6 +7,7 @@ reader; where two columns would do, the reader asks.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -35,15 +36,22 @@ USUAL_NAMES: dict[str, tuple[str | None, ...]] = {
     ),
     "t": (
         *("t", "timestamp", "time", "ts", "datetime", "gpstime", "gpstimestamp", "timestamputc", "timeutc", "utc"),
-        *("epoch", "unixtime", "eventtime", "timems", "timestampms", "timestampns"),
+        *("epoch", "unixtime", "eventtime", "timems", "timestampms", "timestampns", "tstamp", "datetimeutc"),
+        *("utctime", "utcdatetime", "gpsdatetime", "trackedat", "recordedat", "measuredat", "observedat", "sampledat"),
+        *("capturedat", "reportedat", "loggedat", "fixtime", "loctime", "locationtime", "positiontime", "recordtime"),
+        *("recordedtime", None, "devicetime", "createdat", "servertime", "receivedat", "localtime", "date"),
     ),
     "z": ("z", "alt", "altitude", "ele", "elevation", None, "height"),
-    "vehicle_id": ("vehicleid", "vehicle", "vehid", "vin", "deviceid", None, "device"),
+    "vehicle_id": (
+        *("vehicleid", "vehicle", "vehid", "vin", "deviceid", "taxiid", "taxi", "busid", "bus", "cabid", "truckid"),
+        *("userid", "user", "driverid", "imei", "unitid", "agentid", None, "device", "uid"),
+    ),
     "heading": ("heading", "bearing", "course", "azimuth", "headingdeg"),
     "speed": ("speed", "velocity", "speedms", "speedmps"),
     "accuracy": ("accuracy", "horizontalaccuracy", "haccuracy", "hacc", "gpsaccuracy", "positionaccuracy"),
     "kind": ("kind", "class", "classname", "featuretype", "objecttype", None, "label", "type", "category"),
 }
+_NOT_ASKED = ("vehicle_id", "heading", "speed", "accuracy")
 _LON_LAT = (("lon", "lng", "long", "longitude", "gpslon", "gpslongitude"), ("lat", "latitude", "gpslat", "gpslatitude"))
 _PROJECTED = (("x", "easting", "east", "utmx", "utmeasting"), ("y", "northing", "north", "utmy", "utmnorthing"))
 _GEOMETRY = ("geometry", "geom", "wkbgeometry", "position")
@@ -68,6 +76,7 @@ class ColumnChoice:
     columns: dict[str, str]  # our name -> the file's; "geometry" stands for x, y and z in one column
     guessed: tuple[str, ...]  # our names that were found under another, usual name
     degrees: bool  # the coordinates are longitude and latitude by name
+    by_name: tuple[str, ...] = ()  # our names that the user did not give, whatever they are called in the file
 
 
 def choose_columns(
@@ -138,7 +147,7 @@ def choose_columns(
         raise InputError.from_faults(faults, where=where)
     ordered = {name: chosen[name] for name in (*ours, "geometry") if name in chosen}
     guessed = tuple(name for name, theirs in ordered.items() if name not in named and name != theirs)
-    return ColumnChoice(ordered, guessed, degrees)
+    return ColumnChoice(ordered, guessed, degrees, tuple(name for name in ordered if name not in named))
 
 
 def standard_kinds(values: pd.Series) -> pd.Series:
@@ -257,6 +266,8 @@ def _usual(name: str, there: Sequence[str], argument: str, faults: list[str]) ->
     names = USUAL_NAMES[name]
     split = names.index(None) if None in names else len(names)
     found = _best([names[:split], names[split + 1 :]], there)
+    if len(found) > 1 and name in _NOT_ASKED:  # nobody is asked for what may be absent: the likelier name is taken
+        return min(found, key=lambda column: names.index(_plain(column)))
     if len(found) > 1:
         faults.append(_ambiguous(name, found, argument))
     return found[0] if found else None
@@ -286,5 +297,6 @@ def _ambiguous(name: str, found: Sequence[str], argument: str) -> str:
 
 
 def _plain(name: str) -> str:
-    """Bring a name to lower case without separators and a namespace prefix."""
-    return "".join(letter for letter in name.lower().strip() if letter.isalnum())
+    """Bring a name to lower case without separators, a namespace prefix, and a unit in brackets."""
+    without_unit = re.sub(r"[\[(][^\])]*[\])]\s*$", "", name) or name
+    return "".join(letter for letter in without_unit.lower().strip() if letter.isalnum())

@@ -71,7 +71,7 @@ def read_text_table(source: SourceFile, format: FleetFormat | None = None, *, po
     skip = head.n_blank + format.header
     table, unit = _our_columns(_parse(source, names, choice, delimiter, skip), choice)
     guessed = tuple(f"{name}={choice.columns[name]}" for name in choice.guessed)
-    origin = TableOrigin("points" if points else "traces", "line", skip + 1, choice.columns)
+    origin = TableOrigin("points" if points else "traces", "line", skip + 1, choice.columns, choice.by_name)
     return RawTable(table, None, choice.degrees, origin, (*guessed, *([f"t in {unit}"] if unit else [])))
 
 

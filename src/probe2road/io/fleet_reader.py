@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+from numpy.typing import NDArray
 from pyproj import CRS
 
 from probe2road.crs import WGS84, same_crs
 from probe2road.errors import CRSError, InputError
+from probe2road.fleet.cleaning import BY_VEHICLE, ENTERS, accurate_fixes, plausible_headings, tidied
 from probe2road.fleet.contract import Fleet, fleet_from_checked
-from probe2road.fleet.tables import check_points, check_traces
+from probe2road.fleet.tables import TableOrigin, check_points, check_traces
 from probe2road.fleet.trimming import trim_ends
 from probe2road.io.atomic import settled
 from probe2road.io.delimited import read_text_table
@@ -30,6 +33,20 @@ logger = logging.getLogger(__name__)
 
 Source = str | PathLike[str] | Sequence[str | PathLike[str]]
 
+# What libraries raise at damaged files. Memory and interruptions are none of these.
+_DAMAGE = (
+    ValueError,
+    TypeError,
+    LookupError,
+    ArithmeticError,
+    AttributeError,
+    RuntimeError,
+    EOFError,
+    OSError,
+    pa.ArrowException,
+)
+_ROW_NUMBERS = ("id",)  # columns that number traces in some files, and rows in others
+_FEW_ROWS = 3  # of so few, ids that all differ say nothing
 _FILES_SHOWN = 10  # files with faults named in one error
 
 
@@ -45,6 +62,9 @@ def read_fleet(
     bbox: BBox | None = None,
     delimiter: str | None = None,
     header: bool | None = None,
+    invalid: str | None = None,
+    max_accuracy: float | None = None,
+    max_speed: float | None = None,
 ) -> Fleet:
     r"""Read traces, and semantic points where there are any, and check everything.
 
@@ -81,6 +101,14 @@ def read_fleet(
         Of text tables; told from the first line where it is not given.
     header
         Whether text tables start with a line of names, as they do by default; without, the columns are called 0, 1, 2.
+    invalid
+        What happens to rows without position, id or readable time, to lines of text with another number of fields, and
+        to fixes that repeat a time at another place: ``"drop"`` leaves them out with a warning, ``"refuse"`` refuses
+        them. Where it is not given, they are left out if they are no more than 5 % of a file.
+    max_accuracy
+        Metres: fixes that say themselves that they are less accurate are left out.
+    max_speed
+        m/s: fixes that could not have been driven to and away from any slower are left out.
 
     Returns
     -------
@@ -117,12 +145,17 @@ def read_fleet(
         bbox=bbox,
         delimiter=delimiter,
         header=header,
+        invalid=invalid,
+        max_accuracy=max_accuracy,
+        max_speed=max_speed,
     )
     trace_table, trace_crs, told = _read_all(traces, format, points=False)
     point_table, point_crs = None, trace_crs
     if points is not None:
         point_table, point_crs, _ = _read_all(points, format, points=True)
     where = _name(traces)
+    if trace_table is not None and format.max_accuracy is not None:
+        trace_table = accurate_fixes(trace_table, format.max_accuracy, where=where)
     if trace_table is None:
         fix = f"bbox is (left, bottom, right, top) in the CRS of the data, {trace_crs.name}"
         raise InputError(f"no fixes inside bbox {format.bbox}", where=where, fix=fix)
@@ -133,8 +166,10 @@ def read_fleet(
         points_crs=point_crs,
         target_crs=format.target_crs,
         outliers=format.outliers,
+        invalid=format.invalid,
         where=where,
     )
+    fleet = tidied(fleet, max_speed=format.max_speed)
     logger.info(
         "read %d fixes of %d traces and %d semantic points from %s (%s)",
         *(len(fleet.traces), fleet.n_traces, len(fleet.points), where, told),
@@ -178,9 +213,14 @@ def _read_all(source: Source, format: FleetFormat, *, points: bool) -> tuple[pd.
         try:
             raw = _read_one(file, format, points=points)
             crs = _crs_of(raw, file, format.stated_crs)
-            table = _checked_table(raw, file, crs, format.bbox, points=points)
+            table = _checked_table(raw, file, crs, format, points=points)
         except InputError as error:
             errors.append(error)
+            continue
+        except _DAMAGE as error:
+            reason = (str(error).splitlines() or [""])[0]
+            fault = f"the file cannot be read ({type(error).__name__}: {reason})"
+            errors.append(InputError(fault, where=file.path, fix="it may be damaged; copy or write it again"))
             continue
         guesses |= dict.fromkeys(raw.guessed)
         crs_of.setdefault(str(file.path), crs)
@@ -211,24 +251,71 @@ def _crs_of(raw: RawTable, file: SourceFile, given: CRS | None) -> CRS:
         raise CRSError(fault, where=file.path, fix="leave the CRS out, or correct the file")
     crs = raw.crs or given or (WGS84 if raw.degrees else None)
     if crs is None:
-        raise CRSError("no CRS", where=file.path, fix='say which one it is, for example crs="EPSG:32616"')
+        example = "EPSG:4326" if _look_like_degrees(raw.table) else "EPSG:32616"
+        raise CRSError("no CRS", where=file.path, fix=f'say which one it is, for example crs="{example}"')
     return crs
 
 
-def _checked_table(raw: RawTable, file: SourceFile, crs: CRS, bbox: BBox | None, *, points: bool) -> pd.DataFrame:
+def _look_like_degrees(table: pd.DataFrame) -> bool:
+    """Say whether most coordinates could be longitudes and latitudes, and are not drawn near an origin."""
+    x, y = (pd.to_numeric(table[axis], errors="coerce").abs().median() for axis in "xy")
+    return bool(0 < x <= 180 and 0 < y <= 90)
+
+
+def _checked_table(raw: RawTable, file: SourceFile, crs: CRS, format: FleetFormat, *, points: bool) -> pd.DataFrame:
     """Check one file's table and cut it to the bounding box."""
     table = raw.table
-    if bbox is not None and table.empty:
+    if format.bbox is not None and table.empty:
         return table
-    if "trace_id" not in table and not points:
-        logger.warning("%s: no column of trace ids found: the file is one trace", file.path)
-        table = table.assign(trace_id=file.trace_name)
+    by_vehicle = False
+    if not points:
+        table, by_vehicle = _with_trace_ids(table, raw.origin, file)
+        if "t" not in table:
+            logger.warning("%s: no column of times found: rows count as driven in their order", file.path)
     faults: list[str] = []
-    table = (check_points if points else check_traces)(table, crs, faults, origin=raw.origin)
+    check = check_points if points else check_traces
+    table = check(table, crs, faults, origin=raw.origin, invalid=format.invalid)
     if faults:
         raise InputError.from_faults(faults, where=file.path)
-    keep = True if bbox is None else inside(table, bbox)
-    return table if np.all(keep) else table[keep].reset_index(drop=True)
+    if not points:
+        table = plausible_headings(table.reset_index(drop=True), raw.origin, where=file.path)
+        table = table.assign(**{BY_VEHICLE: True}) if by_vehicle else table
+    if format.bbox is None:
+        return table.reset_index(drop=True)
+    keep = inside(table, format.bbox)
+    if not points:
+        table = table.assign(**{ENTERS: _enters(table, keep)})
+    return table[keep].reset_index(drop=True)
+
+
+def _enters(table: pd.DataFrame, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mark the fixes in the box whose trace was outside of it just before, in the order of time."""
+    codes = pd.factorize(table["trace_id"])[0]
+    order = np.lexsort((table["t"].to_numpy("datetime64[ns]").view(np.int64), codes))
+    enters = np.zeros(len(table), bool)
+    before, after = order[:-1], order[1:]
+    enters[after] = keep[after] & ~keep[before] & (codes[after] == codes[before])
+    return enters
+
+
+def _with_trace_ids(table: pd.DataFrame, origin: TableOrigin, file: SourceFile) -> tuple[pd.DataFrame, bool]:
+    """Return the table with trace ids: its own, those of its vehicles (True), or one for the whole file."""
+    if "trace_id" in table:
+        theirs = origin.columns.get("trace_id", "")
+        unique = len(table) >= _FEW_ROWS and table["trace_id"].nunique() == len(table)
+        if not unique or "trace_id" not in origin.by_name:
+            return table, False
+        if theirs.lower() not in _ROW_NUMBERS:
+            logger.warning("%s: column %r (trace_id) differs in every row: every trace is one fix", file.path, theirs)
+            return table, False
+        logger.warning("%s: column %r numbers the rows, it is no trace id; name one with columns", file.path, theirs)
+        table = table.drop(columns="trace_id")
+    if "vehicle_id" in table and table["vehicle_id"].notna().all():
+        theirs = origin.columns.get("vehicle_id", "vehicle_id")
+        logger.warning("%s: no column of trace ids found: traces are told apart by %r", file.path, theirs)
+        return table.assign(trace_id=table["vehicle_id"]), True
+    logger.warning("%s: no column of trace ids found: the file is one trace", file.path)
+    return table.assign(trace_id=file.trace_name), False
 
 
 def _joined(errors: Sequence[InputError], n_files: int) -> InputError:

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 from pyproj import CRS
 
+from probe2road.bounds import MisfitError, Positive, fitted
 from probe2road.crs import parse_crs
 from probe2road.errors import OptionError
 from probe2road.fleet.outliers import OutlierOptions
@@ -30,7 +31,7 @@ class FleetFormat:
     Raises
     ------
     OptionError
-        If ``bbox`` is no box, ``delimiter`` not one character, or ``trim_ends`` negative.
+        If ``bbox`` is no box, ``delimiter`` not one character, ``trim_ends`` negative, or a limit no positive number.
     CRSError
         If pyproj cannot read a CRS.
 
@@ -52,8 +53,10 @@ class FleetFormat:
     delimiter: str | None = None  # of text tables; told from the first line where None
     header: bool = True  # whether text tables start with a line of names; else the columns are 0, 1, 2
     outliers: OutlierOptions = field(default_factory=OutlierOptions)  # what no vehicle can have been at is left out
-
     trim_ends: float = 0.0  # m left out at both ends of every trace, in which somebody may live
+    invalid: str | None = None  # rows without position or readable time: drop or refuse; None: drop up to 5 % of a file
+    max_accuracy: float | None = None  # m; fixes that say that they are less accurate are left out
+    max_speed: float | None = None  # m/s; fixes that no slower vehicle could have come to and left are left out
 
     def __post_init__(self) -> None:
         """Refuse what is no box, no delimiter or no CRS."""
@@ -63,6 +66,13 @@ class FleetFormat:
             raise OptionError(f"delimiter {self.delimiter!r} is not one character", fix="use one, or leave it out")
         if not self.trim_ends >= 0:
             raise OptionError(f"trim_ends is {self.trim_ends}", fix="use metres, 0 or more")
+        if self.invalid not in (None, "drop", "refuse"):
+            raise OptionError(f"invalid is {self.invalid!r}", fix="use drop or refuse, or leave it out")
+        for name in ("max_accuracy", "max_speed"):
+            try:
+                object.__setattr__(self, name, fitted(getattr(self, name), Positive[float] | None, name))
+            except MisfitError as misfit:
+                raise OptionError(misfit.what, fix=misfit.fix) from misfit
         _check_crs(self.crs, self.target_crs)
 
     @cached_property

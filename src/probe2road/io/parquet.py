@@ -80,7 +80,7 @@ def read_parquet(source: SourceFile, format: FleetFormat | None = None, *, point
     file_crs = _crs_of(about, source) if "geometry" in choice.columns and geo else None
     guessed = tuple(f"{name}={choice.columns[name]}" for name in choice.guessed)
     names = {name: choice.columns.get(name, choice.columns.get("geometry", name)) for name in table}
-    origin = TableOrigin("points" if points else "traces", columns=names)
+    origin = TableOrigin("points" if points else "traces", columns=names, by_name=choice.by_name)
     return RawTable(table, file_crs, choice.degrees, origin, (*guessed, *([f"t in {unit}"] if unit else [])))
 
 
