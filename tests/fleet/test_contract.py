@@ -89,7 +89,7 @@ def test_a_trace_with_a_clock_on_some_fixes_only_is_refused() -> None:
         ({"x": ["446000", "446009", "abc", "1", "1"]}, "column 'x' is not a number in 1 of 5 rows (row 2: abc)"),
         ({"x": ["1,5", "1,6", "1,7", "1,8", "1,9"]}, "decimal commas are not read, use points"),
         ({"speed": ["9", "fast", "9", "9", "9"]}, "column 'speed' is not a number in 1 of 5 rows (row 1: fast)"),
-        ({"t": ["2024-05-01", "noon", "2024-05-01", "", None]}, "column 't' is not a time in 2 of 5 rows (row 1: noon"),
+        ({"t": ["2024-05-01", "noon", "2024-05-01", "", None]}, "column 't' is not a time in 1 of 5 rows (row 1: noon"),
         ({"t": [0, 1, 2, 0, 1e15]}, "column 't' is not in seconds since 1970"),
         ({"trace_id": [1, 1, None, 2, 2]}, "column 'trace_id' is empty in 1 of 5 rows"),
     ],

@@ -249,11 +249,11 @@ def _with_whole_clocks(traces: pd.DataFrame, faults: list[str], invalid: str | N
     if partly.empty:
         return traces
     bad = (untimed & traces["trace_id"].isin(partly.index)).to_numpy(bool)
-    what = f"{int(bad.sum())} fixes of {len(partly)} traces have no time ({_few(partly.index)})"
+    what = f"some fixes of {len(partly)} traces have no time ({_few(partly.index)})"
     if not may_leave_out(int(bad.sum()), len(traces), invalid):
-        faults.append(f'traces: some fixes have no time: {what}; drop those fixes, for example with invalid="drop"')
+        faults.append(f'traces: {what}; drop those fixes, for example with invalid="drop"')
         return traces
-    logger.warning("%s: left out", what)
+    logger.warning("%s: %d fixes left out", what, int(bad.sum()))
     return traces[~bad].reset_index(drop=True)
 
 
@@ -318,11 +318,8 @@ def _rows_to_keep(n: int, checks: _Checks, invalid: str | None, *, complain: boo
             for fault, _ in checks.rows:
                 logger.warning("%s: left out", fault)
         return keep
-    all_bad = f"all {n} rows are bad" if n_bad == n else ""
     remedy = "" if n_bad == n or not complain else '; leave such rows out with invalid="drop"'
     checks.faults += [f"{fault}{remedy}" for fault, _ in checks.rows]
-    if all_bad and len(checks.rows) > 1:
-        checks.fault(f"{checks.origin.name}: {all_bad}")
     return np.ones(n, bool)
 
 

@@ -25,7 +25,16 @@ from probe2road.fleet.tables import (
 )
 from probe2road.io.formats import ColumnMap
 
-__all__ = ["KIND_SYNONYMS", "USUAL_NAMES", "ColumnChoice", "choose_columns", "standard_kinds", "times_from_numbers"]
+__all__ = [
+    "KIND_SYNONYMS",
+    "USUAL_NAMES",
+    "ColumnChoice",
+    "choose_columns",
+    "day_numbers",
+    "standard_kinds",
+    "times_from_numbers",
+    "times_of_column",
+]
 
 # Usual names per column of ours, in lower case with separators removed. Names before None are specific; those
 # behind it are so common for other things that they count only where no specific name is there.
@@ -52,6 +61,7 @@ USUAL_NAMES: dict[str, tuple[str | None, ...]] = {
     "kind": ("kind", "class", "classname", "featuretype", "objecttype", None, "label", "type", "category"),
 }
 _NOT_ASKED = ("vehicle_id", "heading", "speed", "accuracy")
+_DAY_STEP = 0.01  # days between fixes, at most; also seconds, which no receiver beats
 _LON_LAT = (("lon", "lng", "long", "longitude", "gpslon", "gpslongitude"), ("lat", "latitude", "gpslat", "gpslatitude"))
 _PROJECTED = (("x", "easting", "east", "utmx", "utmeasting"), ("y", "northing", "north", "utmy", "utmnorthing"))
 _GEOMETRY = ("geometry", "geom", "wkbgeometry", "position")
@@ -182,6 +192,8 @@ def times_from_numbers(values: pd.Series) -> tuple[pd.Series, str]:
     >>> unit, str(times[1])
     ('ms', '2020-01-01 00:00:00.200000+00:00')
     """
+    if (dates := _written_dates(values)) is not None:
+        return dates
     if pd.api.types.is_bool_dtype(values.dtype) or not pd.api.types.is_numeric_dtype(values.dtype):
         return values, ""
     numbers = values.to_numpy(dtype=np.float64, na_value=np.nan)
@@ -198,6 +210,54 @@ def times_from_numbers(values: pd.Series) -> tuple[pd.Series, str]:
         nanoseconds = np.round(np.where(missing, 0.0, numbers) * (1e6 / per_second)).astype(np.int64) * 1000
         nanoseconds[missing] = np.iinfo(np.int64).min
     return pd.Series(nanoseconds.view("datetime64[ns]")).dt.tz_localize("UTC"), unit
+
+
+def times_of_column(values: pd.Series, name: str, *, where: object = None) -> tuple[pd.Series, str]:
+    """Return what `times_from_numbers` does for a column of a file.
+
+    Raises
+    ------
+    InputError
+        If the numbers look like days, not seconds.
+    """
+    if day_numbers(values):
+        first = values.dropna().iloc[0]
+        fault = (
+            f"column {name!r} (t) holds no seconds since 1970: {first:.12g} looks like a day number of a spreadsheet"
+        )
+        raise InputError(fault, where=where, fix="write times as ISO 8601, such as 2024-05-01T08:00:00Z")
+    return times_from_numbers(values)
+
+
+def _written_dates(values: pd.Series) -> tuple[pd.Series, str] | None:
+    """Read numbers such as 20240501080000: dates written without separators. None where any is no such date."""
+    if not pd.api.types.is_integer_dtype(values.dtype) or values.dropna().empty:
+        return None
+    format = {12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}.get(len(str(values.dropna().iloc[0])))
+    if format is None:
+        return None
+    times = pd.to_datetime(values.astype("str"), format=format, errors="coerce", utc=True)
+    read = times.notna()
+    if not (read | values.isna()).all() or not times[read].dt.year.between(1980, 2099).all():
+        return None
+    return times, "yyyymmddHHMMSS"[: 12 if len(format) == 10 else 14]
+
+
+def day_numbers(values: pd.Series) -> bool:
+    """Say whether numbers look like days since 1899-12-30 with the time as fraction, as spreadsheets store times.
+
+    Seconds of a day are of the same size, but lie further apart.
+
+    Examples
+    --------
+    >>> day_numbers(pd.Series([45413.3333333, 45413.3334491])), day_numbers(pd.Series([45413.0, 45423.0]))
+    (True, False)
+    """
+    if not pd.api.types.is_float_dtype(values.dtype):
+        return False
+    steps = values.diff().abs()
+    steps = steps[steps > 0]
+    return bool(20_000 < values.median() < 80_000 and len(steps) and steps.median() < _DAY_STEP)
 
 
 def _given_columns(there: Sequence[str], given: ColumnMap, ours: Sequence[str], where: object) -> dict[str, str]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import gzip
+import json
+import logging
 import re
 import zlib
 from typing import Any, NamedTuple
@@ -12,28 +14,38 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
+from pyproj import CRS
 
 from probe2road.errors import InputError
-from probe2road.fleet.tables import TableOrigin
-from probe2road.io.columns import ColumnChoice, choose_columns, standard_kinds, times_from_numbers
+from probe2road.fleet.tables import TableOrigin, may_leave_out
+from probe2road.io.columns import ColumnChoice, choose_columns, standard_kinds, times_of_column
 from probe2road.io.formats import FleetFormat
 from probe2road.io.sources import RawTable, SourceFile
+from probe2road.io.wkb import text_coordinates
 
 __all__ = ["read_text_table"]
+
+logger = logging.getLogger(__name__)
 
 _DELIMITERS = (",", ";", "\t", "|", " ")  # the earlier one where two are as frequent
 _HEAD = 65536  # bytes looked at for the header
 _WORDS = pa.dictionary(pa.int32(), pa.string())  # few different values in many rows
 _PLAIN_INTEGER = re.compile(r"0|-?[1-9]\d{0,17}")
 _EXAMPLES_SHOWN = 3
+_COMMENTS = ("#", "//", "%")  # that lines above the table start with
+_LINES_PARSED = 20  # to find the delimiter
+_DATE = re.compile(r"\d{4}[-/.]?\d{2}[-/.]?\d{2}([T ]|$)|\d{1,2}[/.]\d{1,2}[/.]\d{4}")
+_NO_ID = (None, "", "NULL", "\\N")
+_NULLS = [*("", "NULL", "null", "Null", "NaN", "nan", "NA", "N/A", "n/a", "#N/A", "None", "\\N", "-", "NaT")]
 
 
 class _Head(NamedTuple):
     """The top of a text file."""
 
-    line: str  # the first that is not blank
-    n_blank: int  # lines above it
-    is_all: bool  # nothing follows
+    lines: list[str]  # the first lines that are neither blank nor comments above the table
+    n_above: int  # lines above the first of them
+    delimiter: str | None  # that the file states itself, as spreadsheets do in a line sep=;
+    is_all: bool  # nothing follows the first line
 
 
 def read_text_table(source: SourceFile, format: FleetFormat | None = None, *, points: bool = False) -> RawTable:
@@ -63,16 +75,20 @@ def read_text_table(source: SourceFile, format: FleetFormat | None = None, *, po
     """
     format = format or FleetFormat()
     head = _read_head(source)
-    delimiter = format.delimiter or max(_DELIMITERS, key=head.line.count)
+    delimiter = format.delimiter or head.delimiter or _delimiter(head.lines)
     names = _column_names(head, delimiter, source, header=format.header)
+    if format.header and not format.columns_of(points=points):
+        _refuse_data_as_names(names, head, source, points=points)
     choice = choose_columns(
         names, format.columns_of(points=points), points=points, crs=format.stated_crs, where=source.path
     )
-    skip = head.n_blank + format.header
-    table, unit = _our_columns(_parse(source, names, choice, delimiter, skip), choice)
+    skip = head.n_above + format.header
+    content = _parse(source, names, choice, delimiter, skip, format)
+    table, unit, crs = _our_columns(content, choice, source)
     guessed = tuple(f"{name}={choice.columns[name]}" for name in choice.guessed)
-    origin = TableOrigin("points" if points else "traces", "line", skip + 1, choice.columns, choice.by_name)
-    return RawTable(table, None, choice.degrees, origin, (*guessed, *([f"t in {unit}"] if unit else [])))
+    named = {name: choice.columns.get(name, choice.columns.get("geometry", name)) for name in table}
+    origin = TableOrigin("points" if points else "traces", "line", skip + 1, named, choice.by_name)
+    return RawTable(table, crs, choice.degrees, origin, (*guessed, *([f"t in {unit}"] if unit else [])))
 
 
 def _read_head(source: SourceFile) -> _Head:
@@ -88,25 +104,72 @@ def _read_head(source: SourceFile) -> _Head:
         raise InputError("the text is UTF-16", where=source.path, fix="save it as UTF-8")
     if b"\0" in head:
         raise InputError("the file is binary, not text", where=source.path, fix="check its suffix")
-    lines = head.splitlines()
-    n_blank = next(number for number, line in enumerate(lines) if line.strip())
+    stated, n_above, lines = None, 0, head.splitlines()
+    for line in lines:
+        text = line.decode("utf-8-sig", errors="replace").strip()
+        if found := re.fullmatch(r'"?sep=(.)"?', text, re.IGNORECASE):
+            stated = found[1]
+        elif text and not text.startswith(_COMMENTS):
+            break
+        n_above += 1
+    below = [line for line in lines[n_above : n_above + _LINES_PARSED] if line.strip()]
+    if not below:
+        raise InputError("the file holds no rows", where=source.path, fix="write it again")
     try:
-        first = lines[n_blank].decode("utf-8-sig")
+        below[0].decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"the first line is not UTF-8 ({error})", where=source.path, fix="save it as UTF-8") from error
-    return _Head(first, n_blank, len(head) < _HEAD and not any(line.strip() for line in lines[n_blank + 1 :]))
+    texts = [line.decode("utf-8-sig", errors="replace") for line in below]
+    return _Head(texts, n_above, stated, len(texts) == 1 and len(head) < _HEAD)
+
+
+def _delimiter(lines: list[str]) -> str:
+    """Return the delimiter that gives most lines the same number of fields, two or more."""
+
+    def fit(delimiter: str) -> tuple[float, int]:
+        widths = [len(cells) for cells in csv.reader(lines, delimiter=delimiter, skipinitialspace=True)]
+        alike = sum(width == widths[0] for width in widths) if widths[0] > 1 else 0
+        return alike, widths[0]
+
+    return max(_DELIMITERS, key=fit)
+
+
+def _refuse_data_as_names(names: list[str], head: _Head, source: SourceFile, *, points: bool) -> None:
+    """Refuse a first line that holds values rather than names, and say how to read the file."""
+    numbers = [number for number, cell in enumerate(names) if _is_number(cell)]
+    times = [number for number, cell in enumerate(names) if _DATE.match(cell)]
+    if len(numbers) + len(times) < max(2, 0.5 * len(names)):
+        return
+    fractions = [number for number in numbers if "." in names[number]]
+    columns: dict[str, str] = {}
+    example = ""
+    if len(fractions) >= 2:
+        x, y = fractions[:2]
+        first, second = float(names[x]), float(names[y])
+        if abs(first) <= 90 < abs(second):
+            x, y = y, x
+        others = [number for number in range(len(names)) if number not in (x, y, *times)]
+        found = [("trace_id", others[:1]), ("t", times[:1]), ("x", [x]), ("y", [y])]
+        columns = {name: str(number) for name, place in found for number in place}
+        degrees = max(abs(first), abs(second)) <= 180
+        example = f', for example columns={json.dumps(columns)} crs="{"EPSG:4326" if degrees else "EPSG:32616"}"'
+        example = example.replace("columns", "point_columns") if points else example
+    shown = head.lines[0] if len(head.lines[0]) <= 60 else f"{head.lines[0][:60]}..."
+    kind = "holds numbers" if len(numbers) == len(names) else "looks like data"
+    raise InputError(
+        f"the first line {kind} ({shown}), not names",
+        where=source.path,
+        fix=f"say that there is no header (header=False); the columns are then called 0, 1, 2{example}",
+    )
 
 
 def _column_names(head: _Head, delimiter: str, source: SourceFile, *, header: bool) -> list[str]:
     """Return the names in the header, or the numbers 0, 1, 2 where there is none."""
     if header and head.is_all:
         raise InputError("no rows below the header", where=source.path, fix="check the export")
-    cells = [cell.strip() for cell in next(csv.reader([head.line], delimiter=delimiter))]
+    cells = [cell.strip() for cell in next(csv.reader(head.lines[:1], delimiter=delimiter))]
     if not header:
         return [str(number) for number in range(len(cells))]
-    if all(map(_is_number, cells)):
-        fix = "say that there is no header (header=False); the columns are then called 0, 1, 2"
-        raise InputError(f"the first line holds numbers ({head.line[:60]}), not names", where=source.path, fix=fix)
     return cells
 
 
@@ -119,10 +182,13 @@ def _distinct_columns(names: list[str], choice: ColumnChoice, source: SourceFile
     return wanted
 
 
-def _parse(source: SourceFile, names: list[str], choice: ColumnChoice, delimiter: str, skip: int) -> pa.Table:
-    """Parse the chosen columns, and report every row that is too short or too long."""
+def _parse(
+    source: SourceFile, names: list[str], choice: ColumnChoice, delimiter: str, skip: int, format: FleetFormat
+) -> pa.Table:
+    """Parse the chosen columns; rows that are too short or too long are left out, or reported if there are many."""
     wanted = _distinct_columns(names, choice, source)
-    types = {choice.columns[name]: _WORDS for name in ("trace_id", "vehicle_id", "kind") if name in choice.columns}
+    types: dict[str, pa.DataType] = {choice.columns["geometry"]: pa.string()} if "geometry" in choice.columns else {}
+    types |= {choice.columns[name]: _WORDS for name in ("trace_id", "vehicle_id", "kind") if name in choice.columns}
     ragged: list[Any] = []
 
     def note(row: Any) -> str:
@@ -139,15 +205,19 @@ def _parse(source: SourceFile, names: list[str], choice: ColumnChoice, delimiter
             parse_options=pyarrow.csv.ParseOptions(delimiter=delimiter, invalid_row_handler=note),
             convert_options=pyarrow.csv.ConvertOptions(
                 include_columns=[number_of[name] for name in wanted],
+                null_values=_NULLS,
                 column_types={number_of[name]: kind for name, kind in types.items()},
             ),
         )
-    except (pa.ArrowInvalid, OSError) as error:
+    except (pa.ArrowException, UnicodeDecodeError, OSError) as error:
         raise _broken(source, error) from error
     if ragged:
         shown = ", ".join(f"line {row.number}: {row.actual_columns}" for row in ragged[:_EXAMPLES_SHOWN])
         fault = f"{len(ragged)} lines do not have {len(names)} fields ({shown}{', ...' if len(ragged) > 3 else ''})"
-        raise InputError(fault, where=source.path, fix=f"repair them, or give the delimiter if it is not {delimiter!r}")
+        if not may_leave_out(len(ragged), content.num_rows + len(ragged), format.invalid):
+            fix = f"repair them, or give the delimiter if it is not {delimiter!r}"
+            raise InputError(fault, where=source.path, fix=fix)
+        logger.warning("%s: %s: left out", source.path, fault)
     content = content.rename_columns(wanted)
     binary = [field.name for field in content.schema if pa.types.is_binary(field.type)]
     if binary:
@@ -155,15 +225,20 @@ def _parse(source: SourceFile, names: list[str], choice: ColumnChoice, delimiter
     return content
 
 
-def _our_columns(content: pa.Table, choice: ColumnChoice) -> tuple[pd.DataFrame, str]:
-    """Rename the columns to ours and read numeric times; and the unit of those times."""
-    table, unit = {}, ""
+def _our_columns(content: pa.Table, choice: ColumnChoice, source: SourceFile) -> tuple[pd.DataFrame, str, CRS | None]:
+    """Rename the columns to ours, unpack points and read numeric times; the unit of those, and the points' CRS."""
+    table: dict[str, Any] = {}
+    unit, crs = "", None
     for name, theirs in choice.columns.items():
+        if name == "geometry":
+            points, crs = text_coordinates(content.column(theirs), name=theirs, where=source.path)
+            table |= points
+            continue
         values = _identifiers(content.column(theirs)) if name.endswith("_id") else content.column(theirs).to_pandas()
         if name == "t":
-            values, unit = times_from_numbers(values)
+            values, unit = times_of_column(values, theirs, where=source.path)
         table[name] = standard_kinds(values) if name == "kind" else values
-    return pd.DataFrame(table, copy=False), unit
+    return pd.DataFrame(table, copy=False), unit, crs
 
 
 def _identifiers(column: pa.ChunkedArray) -> pd.Series:
@@ -171,7 +246,7 @@ def _identifiers(column: pa.ChunkedArray) -> pd.Series:
     encoded = column.unify_dictionaries().combine_chunks()
     if isinstance(encoded, pa.ChunkedArray):
         encoded = encoded.chunk(0) if encoded.num_chunks else pa.array([], _WORDS)
-    words: list[str | None] = [word or None for word in encoded.dictionary.to_pylist()]
+    words: list[str | None] = [None if word in _NO_ID else word for word in encoded.dictionary.to_pylist()]
     codes = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
     if (codes >= 0).all() and all(word is not None and _PLAIN_INTEGER.fullmatch(word) for word in words):
         return pd.Series(np.array(words, np.int64)[codes] if words else np.zeros(0, np.int64))

@@ -47,6 +47,7 @@ _DAMAGE = (
 )
 _ROW_NUMBERS = ("id",)  # columns that number traces in some files, and rows in others
 _FEW_ROWS = 3  # of so few, ids that all differ say nothing
+_FIRST_YEAR, _LAST_YEAR = 1985, 2100  # that drives with a satellite receiver may be from
 _FILES_SHOWN = 10  # files with faults named in one error
 
 
@@ -170,11 +171,23 @@ def read_fleet(
         where=where,
     )
     fleet = tidied(fleet, max_speed=format.max_speed)
+    _warn_of_times(fleet.traces["t"])
     logger.info(
         "read %d fixes of %d traces and %d semantic points from %s (%s)",
         *(len(fleet.traces), fleet.n_traces, len(fleet.points), where, told),
     )
     return trim_ends(fleet, format.trim_ends)
+
+
+def _warn_of_times(times: pd.Series) -> None:
+    """Warn of a fleet at a time before satellites, or that nobody has lived to see."""
+    middle = times.dropna().median() if times.notna().any() else None
+    if middle is not None and not _FIRST_YEAR <= middle.year <= _LAST_YEAR:
+        logger.warning(
+            "half of the times are before %s: in the year %d are no such drives; numbers count as seconds since 1970 "
+            "if nothing else is told by their size, check the column of times",
+            *(middle.isoformat(), middle.year),
+        )
 
 
 def read_fleet_files(path: str | PathLike[str]) -> Fleet:

@@ -16,7 +16,7 @@ from pyproj import CRS
 from probe2road.crs import parse_crs
 from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin
-from probe2road.io.columns import ColumnChoice, choose_columns, standard_kinds, times_from_numbers
+from probe2road.io.columns import ColumnChoice, choose_columns, standard_kinds, times_of_column
 from probe2road.io.formats import BBox, FleetFormat
 from probe2road.io.sources import RawTable, SourceFile
 from probe2road.io.wkb import point_coordinates
@@ -70,8 +70,8 @@ def read_parquet(source: SourceFile, format: FleetFormat | None = None, *, point
         condition = None if bbox is None else _row_filter(choice, about, dataset.schema, bbox)
         wanted = list(dict.fromkeys(choice.columns.values()))
         content = dataset.to_table(columns=wanted, filter=condition)
-    except (pa.ArrowInvalid, pa.ArrowNotImplementedError, OSError) as error:
-        reason = str(error).splitlines()[0]
+    except (pa.ArrowException, UnicodeDecodeError, OSError) as error:
+        reason = (str(error).splitlines() or [""])[0]
         fix = "it may be truncated; copy or write it again"
         raise InputError(f"not a readable Parquet file ({reason})", where=source.path, fix=fix) from error
     table, unit = _our_columns(content, choice, source)
@@ -142,6 +142,6 @@ def _our_columns(content: pa.Table, choice: ColumnChoice, source: SourceFile) ->
             column = column.cast(pa.float64())
         values = column.to_pandas()
         if name == "t":
-            values, unit = times_from_numbers(values)
+            values, unit = times_of_column(values, theirs, where=source.path)
         table[name] = standard_kinds(values) if name == "kind" else values.reset_index(drop=True)
     return pd.DataFrame(table, copy=False), unit

@@ -8,15 +8,19 @@ fixed-size list of them.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import shapely
 from numpy.typing import NDArray
+from pyproj import CRS
 
+from probe2road.crs import parse_crs
 from probe2road.errors import InputError
 
-__all__ = ["point_coordinates"]
+__all__ = ["point_coordinates", "text_coordinates"]
 
 # Geometry type codes of a point: ISO WKB, and the high bit with which EWKB marks a height.
 _POINT_CODES = {21: (1,), 29: (1001, 0x80000001)}
@@ -44,7 +48,6 @@ def point_coordinates(column: pa.ChunkedArray, *, name: str, where: object = Non
 
     Examples
     --------
-    >>> import shapely
     >>> points = pa.chunked_array([shapely.to_wkb(shapely.points([[1.0, 2.0], [3.0, 4.0]]))])
     >>> point_coordinates(points, name="geometry")["y"].tolist()
     [2.0, 4.0]
@@ -58,6 +61,61 @@ def point_coordinates(column: pa.ChunkedArray, *, name: str, where: object = Non
     axes = [axis for axis in "xyz" if any(axis in part for part in parts)]
     flat = {axis: [part.get(axis, np.full(len(part["x"]), np.nan)) for part in parts] for axis in axes}
     return {axis: arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for axis, arrays in flat.items()}
+
+
+def text_coordinates(
+    column: pa.ChunkedArray, *, name: str, where: object = None
+) -> tuple[dict[str, NDArray[np.float64]], CRS | None]:
+    """Return the coordinates of a column of points in text: WKT, WKB in hexadecimal digits, or GeoJSON.
+
+    Parameters
+    ----------
+    column
+        Text; missing and unreadable values become NaN.
+    name, where
+        Column and file, for messages.
+
+    Returns
+    -------
+    (dict, CRS or None)
+        ``x``, ``y`` and, where any point has a height, ``z``: float64 arrays of the column's length; and the CRS that
+        a prefix ``SRID=4326;`` or extended WKB names.
+
+    Raises
+    ------
+    InputError
+        If the column holds lines or areas, or nothing that can be read.
+
+    Examples
+    --------
+    >>> points, crs = text_coordinates(pa.chunked_array([["SRID=4326;POINT (13.5 52.5)", None]]), name="geom")
+    >>> points["x"].tolist(), crs.to_epsg()
+    ([13.5, nan], 4326)
+    """
+    words = column.to_pandas().astype(object)
+    words = words.where(words.notna(), None).map(lambda word: word.strip() if isinstance(word, str) else None)
+    first = next((word for word in words if word), "")
+    srid = None
+    if first[:1] == "{":
+        points = shapely.from_geojson(words.to_numpy(), on_invalid="ignore")
+    elif re.fullmatch(r"0[01][0-9A-Fa-f]{8,}", first):
+        points = shapely.from_wkb(words.to_numpy(), on_invalid="ignore")
+        srid = int(shapely.get_srid(next((point for point in points if point is not None), None)))
+    else:
+        if found := re.match(r"SRID=(\d+);", first, re.IGNORECASE):
+            srid = int(found[1])
+            words = words.str.replace(r"(?i)^SRID=\d+;", "", regex=True)
+        points = shapely.from_wkt(words.where(words.notna(), None).to_numpy(), on_invalid="ignore")
+    kinds = shapely.get_type_id(points)
+    if ((kinds != 0) & (kinds != -1)).any():
+        raise _not_points(name, where)
+    if len(points) and (kinds == -1).all():
+        fault = f"column {name!r} holds no points that can be read ({first[:60]})"
+        raise InputError(fault, where=where, fix="write POINT (x y), or name the columns of x and y")
+    axes = {"x": shapely.get_x(points), "y": shapely.get_y(points)}
+    if shapely.has_z(points).any():
+        axes["z"] = shapely.get_z(points)
+    return axes, parse_crs(srid, where=where) if srid and srid > 0 else None
 
 
 def _coordinates(chunk: Any, name: str, where: object) -> dict[str, NDArray[np.float64]]:
