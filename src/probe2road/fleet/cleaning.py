@@ -142,9 +142,8 @@ def cut_traces(
     words = ids.astype(str)
     named = words.where(~is_cut, words + "/" + pd.Series(piece.astype(str), index=words.index))
     logger.info("cut %d traces into %d more", int(np.unique(owner[starts]).size), int(starts.sum()))
-    begins = {name: rows for name, rows in traces.assign(piece=named)[is_cut].groupby(words[is_cut], sort=False)}
     names = points["trace_id"].astype(str)
-    for name, rows in begins.items():
+    for name, rows in traces.assign(piece=named)[is_cut].groupby(words[is_cut], sort=False):
         mine = np.flatnonzero((names == name).to_numpy(bool))
         at = rows["t"].searchsorted(points["t"].iloc[mine], side="right") - 1 if len(mine) else []
         names.iloc[mine] = rows["piece"].to_numpy()[np.clip(at, 0, len(rows) - 1)] if len(mine) else []
@@ -193,7 +192,7 @@ def _with_true_headings(traces: pd.DataFrame) -> pd.DataFrame:
         return traces
     shown = ", ".join(map(str, false[:3])) + (", ..." if len(false) > 3 else "")
     logger.warning(
-        "headings of %d of %d traces contradict their movement (%s): unknown; headings are degrees clockwise from north",
+        "headings of %d of %d traces contradict their movement (%s): unknown; they are to be degrees from north",
         *(len(false), len(judged), shown),
     )
     return traces.assign(heading=np.where(traces["trace_id"].isin(false), np.nan, heading))

@@ -52,6 +52,7 @@ _SHARE_LEFT_OUT = 0.05  # of the rows of a file that may be left out unasked
 _EXAMPLES_SHOWN = 3  # offending rows named in a fault
 _MOST_SECONDS = 9.2e9  # since 1970; a time in nanoseconds holds no more
 _FIRST_TIME, _LAST_TIME = (limit.tz_localize("UTC") for limit in (pd.Timestamp(1678, 1, 1), pd.Timestamp(2262, 1, 1)))
+_LONGEST_VALUE = 40  # characters of a value that a message shows
 _SAME_PLACE = 0.01  # m; repeated fixes at one instant nearer than this are one fix
 _DEGREES_PER_METRE = 1e-5  # of latitude, rounded up
 _POLAR = 80.0  # degrees of latitude beyond which swapped columns are likelier than roads
@@ -80,7 +81,7 @@ class TableOrigin:
         rows = np.flatnonzero(mask)
         values = np.asarray(pd.Series(values).iloc[rows[:_EXAMPLES_SHOWN]])
         shown = ", ".join(
-            f"{self.row_word} {row + self.first_row}: {value}" for row, value in zip(rows, values, strict=False)
+            f"{self.row_word} {row + self.first_row}: {_brief(value)}" for row, value in zip(rows, values, strict=False)
         )
         return f"{len(rows)} of {len(mask)} rows ({shown}{', ...' if len(rows) > _EXAMPLES_SHOWN else ''})"
 
@@ -525,4 +526,10 @@ def _codes(ids: pd.Series) -> NDArray[np.int64]:
 def _few(values: Any) -> str:
     """List the first few values."""
     values = list(values)
-    return ", ".join(map(str, values[:_EXAMPLES_SHOWN])) + (", ..." if len(values) > _EXAMPLES_SHOWN else "")
+    return ", ".join(map(_brief, values[:_EXAMPLES_SHOWN])) + (", ..." if len(values) > _EXAMPLES_SHOWN else "")
+
+
+def _brief(value: Any) -> str:
+    """Write a value in a message, cut where it is long."""
+    text = str(value)
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."

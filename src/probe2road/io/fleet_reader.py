@@ -290,6 +290,7 @@ def _checked_table(raw: RawTable, file: SourceFile, crs: CRS, format: FleetForma
     table = check(table, crs, faults, origin=raw.origin, invalid=format.invalid)
     if faults:
         raise InputError.from_faults(faults, where=file.path)
+    skipped = None if raw.skipped is None else raw.skipped[table.index.to_numpy()]
     if not points:
         table = plausible_headings(table.reset_index(drop=True), raw.origin, where=file.path)
         table = table.assign(**{BY_VEHICLE: True}) if by_vehicle else table
@@ -297,17 +298,26 @@ def _checked_table(raw: RawTable, file: SourceFile, crs: CRS, format: FleetForma
         return table.reset_index(drop=True)
     keep = inside(table, format.bbox)
     if not points:
-        table = table.assign(**{ENTERS: _enters(table, keep)})
+        table = table.assign(**{ENTERS: _enters(table, keep, skipped)})
     return table[keep].reset_index(drop=True)
 
 
-def _enters(table: pd.DataFrame, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mark the fixes in the box whose trace was outside of it just before, in the order of time."""
+def _enters(table: pd.DataFrame, keep: NDArray[np.bool_], skipped: NDArray[np.int64] | None) -> NDArray[np.bool_]:
+    """Mark the fixes in the box whose trace was outside of it just before, in the order of time.
+
+    Where part of the file between two fixes was not read, a pause longer than usual tells that fixes are missing.
+    """
     codes = pd.factorize(table["trace_id"])[0]
     order = np.lexsort((table["t"].to_numpy("datetime64[ns]").view(np.int64), codes))
     enters = np.zeros(len(table), bool)
     before, after = order[:-1], order[1:]
-    enters[after] = keep[after] & ~keep[before] & (codes[after] == codes[before])
+    same = codes[after] == codes[before]
+    enters[after] = same & keep[after] & ~keep[before]
+    if skipped is not None and same.any():
+        interval = np.diff(table["t"].to_numpy("datetime64[ns]")[order]) / np.timedelta64(1, "s")
+        usual = np.nanmedian(interval[same]) if np.isfinite(interval[same]).any() else 0.0
+        missing = (skipped[after] != skipped[before]) & ~(interval <= 1.5 * usual)
+        enters[after] |= same & keep[after] & missing
     return enters
 
 

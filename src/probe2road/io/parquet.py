@@ -69,19 +69,46 @@ def read_parquet(source: SourceFile, format: FleetFormat | None = None, *, point
         about = geo["columns"].get(choice.columns.get("geometry"), {}) if geo else {}
         condition = None if bbox is None else _row_filter(choice, about, dataset.schema, bbox)
         wanted = list(dict.fromkeys(choice.columns.values()))
-        content = dataset.to_table(columns=wanted, filter=condition)
+        content, skipped = _read_groups(dataset, wanted, condition)
     except (pa.ArrowException, UnicodeDecodeError, OSError) as error:
         reason = (str(error).splitlines() or [""])[0]
         fix = "it may be truncated; copy or write it again"
         raise InputError(f"not a readable Parquet file ({reason})", where=source.path, fix=fix) from error
-    table, unit = _our_columns(content, choice, source)
-    if bbox is not None:
-        table = table[inside(table, bbox)].reset_index(drop=True)
+    try:
+        table, unit = _our_columns(content, choice, source)
+    except (pa.ArrowException, UnicodeDecodeError) as error:
+        reason = (str(error).splitlines() or [""])[0]
+        fault = f"a column cannot be read ({reason})"
+        raise InputError(fault, where=source.path, fix="write the file again, or name other columns") from error
     file_crs = _crs_of(about, source) if "geometry" in choice.columns and geo else None
     guessed = tuple(f"{name}={choice.columns[name]}" for name in choice.guessed)
     names = {name: choice.columns.get(name, choice.columns.get("geometry", name)) for name in table}
     origin = TableOrigin("points" if points else "traces", columns=names, by_name=choice.by_name)
-    return RawTable(table, file_crs, choice.degrees, origin, (*guessed, *([f"t in {unit}"] if unit else [])))
+    told = (*guessed, *([f"t in {unit}"] if unit else []))
+    return RawTable(table, file_crs, choice.degrees, origin, told, skipped)
+
+
+def _read_groups(
+    dataset: Any, wanted: list[str], condition: ds.Expression | None
+) -> tuple[pa.Table, NDArray[np.int64] | None]:
+    """Read the row groups that may hold rows of the box, whole; and the number of groups skipped before every row.
+
+    Rows outside are needed: a trace that leaves the box and comes back is two.
+    """
+    if condition is None:
+        return dataset.to_table(columns=wanted), None
+    tables, skipped, n_skipped, n_groups = [], [], 0, 0
+    for fragment in dataset.get_fragments():
+        kept = [group.id for group in fragment.subset(condition).row_groups]
+        for number in kept:
+            n_skipped += number - n_groups
+            n_groups = number + 1
+            part = fragment.subset(row_group_ids=[number]).to_table(schema=dataset.schema, columns=wanted)
+            tables.append(part)
+            skipped.append(np.full(part.num_rows, n_skipped, np.int64))
+    if not tables:
+        return dataset.schema.empty_table().select(wanted), np.zeros(0, np.int64)
+    return pa.concat_tables(tables), np.concatenate(skipped)
 
 
 def inside(table: pd.DataFrame, bbox: BBox) -> NDArray[np.bool_]:

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from pyproj import CRS
 
 from probe2road.errors import InputError, MissingFileError
@@ -42,6 +44,7 @@ class RawTable:
     degrees: bool  # the columns are called longitude and latitude
     origin: TableOrigin
     guessed: tuple[str, ...] = ()  # "ours=theirs" of every column found by usual name
+    skipped: NDArray[np.int64] | None = None  # parts of the file outside the box, and not read, before every row
 
 
 def find_sources(

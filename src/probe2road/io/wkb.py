@@ -32,7 +32,7 @@ def point_coordinates(column: pa.ChunkedArray, *, name: str, where: object = Non
     Parameters
     ----------
     column
-        WKB of 2-D or 3-D points, or GeoArrow points (struct or fixed-size list), without missing values.
+        WKB of 2-D or 3-D points, or GeoArrow points (struct or fixed-size list); missing ones become NaN.
     name, where
         Column and file, for messages.
 
@@ -44,7 +44,7 @@ def point_coordinates(column: pa.ChunkedArray, *, name: str, where: object = Non
     Raises
     ------
     InputError
-        If a geometry is missing or no point, or if the column is of another type.
+        If a geometry is no point, or if the column is of another type.
 
     Examples
     --------
@@ -53,14 +53,26 @@ def point_coordinates(column: pa.ChunkedArray, *, name: str, where: object = Non
     [2.0, 4.0]
     """
     chunks = [chunk.storage if isinstance(chunk, pa.ExtensionArray) else chunk for chunk in column.chunks]
-    if column.null_count:
-        raise InputError(f"column {name!r} is empty in {column.null_count} of {len(column)} rows", where=where)
-    parts = [_coordinates(chunk, name, where) for chunk in chunks if len(chunk)]
+    parts = [_with_holes(chunk, name, where) for chunk in chunks if len(chunk)]
     if not parts:
         return {axis: np.zeros(0) for axis in "xy"}
     axes = [axis for axis in "xyz" if any(axis in part for part in parts)]
     flat = {axis: [part.get(axis, np.full(len(part["x"]), np.nan)) for part in parts] for axis in axes}
     return {axis: arrays[0] if len(arrays) == 1 else np.concatenate(arrays) for axis, arrays in flat.items()}
+
+
+def _with_holes(chunk: Any, name: str, where: object) -> dict[str, NDArray[np.float64]]:
+    """Return the coordinates of one array, NaN where a value is missing."""
+    if chunk.null_count == 0:
+        return _coordinates(chunk, name, where)
+    if chunk.null_count == len(chunk):
+        return {axis: np.full(len(chunk), np.nan) for axis in "xy"}
+    there = chunk.is_valid().to_numpy(zero_copy_only=False)
+    whole = {}
+    for axis, values in _coordinates(chunk.drop_null(), name, where).items():
+        whole[axis] = np.full(len(chunk), np.nan)
+        whole[axis][there] = values
+    return whole
 
 
 def text_coordinates(
