@@ -16,7 +16,16 @@ from probe2road.cli.main import app, main
 from probe2road.cli.reading import spoken
 
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-FLEET = {"--columns", "--crs", "--target-crs", "--bbox", "--delimiter", "--no-header"}
+FLEET = {
+    "--columns",
+    "--crs",
+    "--target-crs",
+    "--bbox",
+    "--delimiter",
+    "--no-header",
+    "--invalid",
+    "--max-accuracy",
+} | {"--max-speed"}
 GRAPH = {"--layer", "--graph-crs"}
 REFERENCE = {"--reference-layer", "--reference-crs"}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -190,7 +189,7 @@ def test_a_first_line_of_data_is_told(tmp_path: Path) -> None:
 def test_numbers_that_are_no_seconds(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     days = 45413.3333333 + np.arange(40) / 86400
     for suffix in ("csv", "parquet"):
-        with pytest.raises(InputError, match="column 'time' .* looks like a day number"):
+        with pytest.raises(InputError, match=r"column 'time' .* looks like a day number"):
             read(tmp_path, drive(time=days), suffix=suffix)
     written_out = [int(f"2024050108{minute:02d}") for minute in range(40)]
     assert read(tmp_path, drive(time=written_out)).traces["t"].iloc[1] == pd.Timestamp("2024-05-01T08:01Z")

@@ -79,7 +79,7 @@ def accurate_fixes(table: pd.DataFrame, max_accuracy: float, *, where: object = 
 
 
 def tidied(fleet: Fleet, *, max_speed: float | None = None) -> Fleet:
-    """Return a fleet without jumps, without headings that contradict the movement, cut where traces left the box or vehicles paused.
+    """Return a fleet without jumps and false headings, cut where traces left the box or vehicles paused.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def _with_true_headings(traces: pd.DataFrame) -> pd.DataFrame:
     heading: Any = traces["heading"].to_numpy()
     moving = same & (np.hypot(east, north) > _MOVING) & np.isfinite(heading)
     off = np.abs((heading - np.degrees(np.arctan2(east, north)) + 180.0) % 360.0 - 180.0)
-    by_trace = pd.Series(off[moving]).groupby(traces["trace_id"].array[moving])
+    by_trace = pd.Series(off, traces.index)[moving].groupby(traces["trace_id"][moving])
     judged = by_trace.median()[by_trace.size() >= _FEW_STEPS]
     false = judged.index[judged > _CONTRADICTION]
     if len(false) == 0:
