@@ -104,20 +104,19 @@ def text_coordinates(
     >>> points["x"].tolist(), crs.to_epsg()
     ([13.5, nan], 4326)
     """
-    words = column.to_pandas().astype(object)
-    words = words.where(words.notna(), None).map(lambda word: word.strip() if isinstance(word, str) else None)
+    words = [word.strip() if isinstance(word, str) else None for word in column.to_pylist()]
     first = next((word for word in words if word), "")
     srid = None
     if first[:1] == "{":
-        points = shapely.from_geojson(words.to_numpy(), on_invalid="ignore")
+        points = shapely.from_geojson(np.array(words, object), on_invalid="ignore")
     elif re.fullmatch(r"0[01][0-9A-Fa-f]{8,}", first):
-        points = shapely.from_wkb(words.to_numpy(), on_invalid="ignore")
+        points = shapely.from_wkb(np.array(words, object), on_invalid="ignore")
         srid = int(shapely.get_srid(next((point for point in points if point is not None), None)))
     else:
         if found := re.match(r"SRID=(\d+);", first, re.IGNORECASE):
             srid = int(found[1])
-            words = words.str.replace(r"(?i)^SRID=\d+;", "", regex=True)
-        points = shapely.from_wkt(words.where(words.notna(), None).to_numpy(), on_invalid="ignore")
+            words = [None if word is None else word.rpartition(";")[2] for word in words]
+        points = shapely.from_wkt(np.array(words, object), on_invalid="ignore")
     kinds = shapely.get_type_id(points)
     if ((kinds != 0) & (kinds != -1)).any():
         raise _not_points(name, where)
