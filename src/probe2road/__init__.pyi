@@ -34,6 +34,7 @@ from .errors import Probe2RoadError as Probe2RoadError
 from .fleet.contract import Fleet as Fleet
 from .fleet.contract import TraceGaps as TraceGaps
 from .fleet.contract import fleet_from_tables as fleet_from_tables
+from .fleet.outliers import OutlierOptions as OutlierOptions
 from .graph.check import check_graph as check_graph
 from .graph.clean import CleanOptions as CleanOptions
 from .graph.clean import clean_graph as clean_graph
