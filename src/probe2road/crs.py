@@ -265,8 +265,8 @@ def require_same_crs(
     >>> require_same_crs(CRS.from_epsg(32616), CRS.from_epsg(32617), where="match")
     Traceback (most recent call last):
         ...
-    probe2road.errors.CRSError: match: the traces are in WGS 84 / UTM zone 16N, the graph is in WGS 84 / UTM zone 17N;
-    reproject one of them, for example with to_crs
+    probe2road.errors.CRSError: match: two CRS that differ: the traces are in WGS 84 / UTM zone 16N, the graph is in WGS
+    84 / UTM zone 17N; reproject one of them, for example with to_crs
     """
     if not same_crs(first, second):
         fault = f"two CRS that differ: {what[0]} in {first.name}, {what[1]} in {second.name}"

@@ -175,7 +175,7 @@ def test_an_interrupted_run_goes_on(road: Any, tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         align(fleet, options=options, workspace=tmp_path / "work", progress=stop)
-    assert len(list((tmp_path / "work").glob("*-moves.*"))) == 2
+    assert len(list((tmp_path / "work").glob("tile-*"))) == 2
     resumed = align(fleet, options=options, workspace=tmp_path / "work")
     for axis in "xyz":
         assert np.allclose(resumed.fleet.traces[axis], whole.fleet.traces[axis], rtol=0.0, atol=0.01)

@@ -54,7 +54,7 @@ def test_without_proof_it_stays_in_pieces(gaps: dict[str, float]) -> None:
 
 def test_one_way_edges_run_in_their_driving_direction() -> None:
     against = [[(500, 0), (-200, 0)], [(100, 300), (100, -300)], [(180, -300), (180, 300)]]
-    edges = refine(graph_from_lines(against, crs=CRS), drives(12)).edges
+    edges = refine(graph_from_lines(against, crs=CRS), drives(12), learned=False).edges
     assert edges["oneway"].tolist() == ["yes"] * 3
     assert edges[["u", "v", "forward", "backward"]].to_numpy().tolist() == [[1, 0, 12, 0], [3, 2, 12, 0], [4, 5, 12, 0]]
     first, last = (shapely.get_coordinates(shapely.get_point(edges.geometry.to_numpy(), end)) for end in (0, -1))

@@ -141,8 +141,9 @@ def test_a_raster_with_too_few_channels_is_refused(fleet, write_weights):
 
 
 def test_another_resolution_is_refused(fleet, write_weights):
+    coarse = options(write_weights(GNSS))
     with pytest.raises(OptionError, match=r"pixels of 1\.0 m, the raster has 0\.5 m; use resolution=1\.0"):
-        build(fleet, options=replace(options(write_weights(GNSS)), resolution=0.5))
+        build(fleet, options=replace(coarse, segmentation=replace(coarse.segmentation, resolution=0.5)))
 
 
 def test_an_all_zero_raster_has_no_roads(fleet, write_weights):

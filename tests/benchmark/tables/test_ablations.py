@@ -13,7 +13,6 @@ from probe2road.benchmark.tables.measured import Measured
 from probe2road.benchmark.tables.source import Source
 from probe2road.cli.main import main
 from probe2road.errors import InputError, OptionError
-from probe2road.recipe import Segmentation
 from probe2road.segmentation.weights import read_weights
 
 NAME = "interchange-diamond-1"
@@ -110,7 +109,7 @@ def test_every_variant_has_a_folder_of_its_own_and_differs_from_the_base_in_one_
         assert len(places) == len(ablation.variants) - shared
         for variant in ablation.variants:
             if variant.like is not None:
-                assert Segmentation.of(variant.method.options) == Segmentation.of(variant.like.options)
+                assert variant.method.options.segmentation == variant.like.options.segmentation
                 assert variant.source == source
         assert ablation.default in [variant.label for variant in ablation.variants]
 

@@ -45,7 +45,7 @@ def test_the_command_writes_tables_cells_and_pictures(tables):
     ]
     config = json.loads(rows[2]["config"])
     assert config["dataset"] == NAME
-    assert config["options"]["segmenter"] == "network"
+    assert config["options"]["segmentation"]["segmenter"] == "network"
     assert config["weights"]
     assert float(rows[2]["geo_f1"]) > 0.8
     assert float(rows[2]["seconds"]) > 0

@@ -20,7 +20,7 @@ import pandas as pd
 import shapely
 
 from probe2road.crs import WGS84, local_crs, parse_crs, require_metric, transform
-from probe2road.errors import InputError
+from probe2road.errors import InputError, MissingFileError
 from probe2road.graph.direction import DIRECTION_TAGS, tagged_direction
 from probe2road.io.osm_ways import OsmWays, read_restrictions, read_ways, split_at_shared_nodes
 from probe2road.simulation.networks.altitude import solve_heights
@@ -109,7 +109,7 @@ def read_network(
     probe2road.errors.MissingFileError: nowhere.osm: no such file; check the path
     """
     if not Path(path).is_file():
-        raise InputError("no such file", where=path, fix="check the path")
+        raise MissingFileError("no such file", where=path, fix="check the path")
     found = read_ways(path, highways)
     placed = found.select_vertices(found.placed)
     ways = _usable_ways(placed)
