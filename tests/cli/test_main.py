@@ -39,7 +39,12 @@ def folder(tmp_path_factory):
     drives = []
     for trip in range(12):
         east, north = (at, np.full_like(at, 300.0)) if trip % 2 else (np.full_like(at, 300.0), at)
-        table = {"trip": trip, "clock": np.arange(len(at)), "e": 446000 + east, "n": 4636000 + north + rng.normal()}
+        table = {
+            "trip": trip,
+            "clock": 1714550400 + np.arange(len(at)),
+            "e": 446000 + east,
+            "n": 4636000 + north + rng.normal(),
+        }
         drives.append(pd.DataFrame(table))
     path = tmp_path_factory.mktemp("cli")
     pd.concat(drives).to_csv(path / "drives.csv", index=False)

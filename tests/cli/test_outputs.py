@@ -27,7 +27,9 @@ def folder(tmp_path: Path) -> Path:
     corner = pd.DataFrame({"e": np.r_[at, np.full(10, 200.0)], "n": np.r_[np.zeros(20), np.arange(0.0, 100, 10)]})
     back = corner[::-1].reset_index(drop=True)
     back.loc[0, "n"] = 900.0
-    drives = [table.assign(trip=trip, clock=np.arange(30)) for trip, table in enumerate((corner, back), start=1)]
+    drives = [
+        table.assign(trip=trip, clock=1714550400 + np.arange(30)) for trip, table in enumerate((corner, back), start=1)
+    ]
     table = pd.concat(drives)
     table.assign(e=446000 + table["e"], n=4636000 + table["n"]).to_csv(tmp_path / "drives.csv", index=False)
     streets = [[(446000, 4636000), (446200, 4636000)], [(446200, 4636000), (446200, 4636100)]]

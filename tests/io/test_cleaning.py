@@ -201,7 +201,7 @@ def test_semantic_points_of_nobody_are_warned_of(tmp_path: Path, caplog: pytest.
     points.to_csv(tmp_path / "seen.csv", index=False)
     read(tmp_path, drive(), points=tmp_path / "seen.csv")
     assert "1 of 2 semantic points are of traces that are not there" in caplog.text
-    assert "1 of 2 semantic points are more than 500 m from the traces" in caplog.text
+    assert "left out 1 of 2 semantic points, which are more than 5 km from their traces" in caplog.text
 
 
 def test_messages_are_some_lines(tmp_path: Path) -> None:

@@ -77,10 +77,10 @@ def test_a_foreign_osmnx_graph_becomes_one_edge_per_road() -> None:
 
 def test_undirected_graphs_may_hold_their_geometry_either_way_round() -> None:
     undirected = nx.MultiGraph(crs=UTM)
-    undirected.add_nodes_from([(0, {"x": 0.0, "y": 0.0}), (1, {"x": 60.0, "y": 80.0})])
-    undirected.add_edge(0, 1, geometry=shapely.LineString([(60, 80), (0, 80), (0, 0)]))
+    undirected.add_nodes_from([(0, {"x": EAST, "y": NORTH}), (1, {"x": EAST + 60, "y": NORTH + 80})])
+    undirected.add_edge(0, 1, geometry=shapely.LineString([(EAST + 60, NORTH + 80), (EAST, NORTH + 80), (EAST, NORTH)]))
     graph = from_networkx(undirected)
-    assert graph.edges["length"].tolist() == [140.0]
+    assert graph.edges["length"].tolist() == pytest.approx([140.0])
 
 
 def test_networkx_graphs_without_crs_or_coordinates_are_refused() -> None:

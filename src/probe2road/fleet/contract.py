@@ -43,7 +43,6 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 _MOST_STRAYS = 3  # fixes in a row that a trace goes past
-_FAR_POINT = 500.0  # m; no camera sees so far
 
 
 @dataclass(frozen=True, eq=False)
@@ -400,23 +399,7 @@ def fleet_from_checked(
         if not all(np.isfinite(table[axis].to_numpy()).all() for axis in "xy"):
             fault = f"{name}: positions cannot be projected to {target.name}"
             raise InputError(fault, where=where, fix="check the CRS")
-    _warn_of_strange_points(fleet)
     return fleet
-
-
-def _warn_of_strange_points(fleet: Fleet) -> None:
-    """Warn of semantic points whose trace is not there, and of those that no camera in these traces can have seen."""
-    if fleet.points.empty:
-        return
-    unknown = ~fleet.points["trace_id"].isin(fleet.ids).to_numpy()
-    left, bottom, right, top = fleet.bounds
-    x, y = fleet.points["x"].to_numpy(), fleet.points["y"].to_numpy()
-    far = np.hypot(np.maximum(left - x, x - right).clip(0), np.maximum(bottom - y, y - top).clip(0)) > _FAR_POINT
-    n = len(unknown)
-    if unknown.any():
-        logger.warning("%d of %d semantic points are of traces that are not there", int(unknown.sum()), n)
-    if far.any():
-        logger.warning("%d of %d semantic points are more than %g m from the traces", int(far.sum()), n, _FAR_POINT)
 
 
 def _metric_target(traces: pd.DataFrame, source: CRS, target_crs: Any, where: object) -> CRS:

@@ -69,7 +69,7 @@ def from_networkx(graph: nx.Graph, *, target_crs: Any = None) -> RoadGraph:
     Examples
     --------
     >>> foreign = nx.MultiDiGraph(crs="EPSG:32616")
-    >>> foreign.add_nodes_from([(7, {"x": 0, "y": 0}), (9, {"x": 30, "y": 40})])
+    >>> foreign.add_nodes_from([(7, {"x": 446000, "y": 4636000}), (9, {"x": 446030, "y": 4636040})])
     >>> foreign.add_edges_from([(7, 9, {"highway": "service"}), (9, 7, {"highway": "service"})])
     [0, 0]
     >>> from_networkx(foreign).edges[["u", "v", "length", "highway"]].values.tolist()

@@ -10,6 +10,7 @@ from probe2road.benchmark.sets import recording as module
 from probe2road.benchmark.sets.recording import record_fleet
 from probe2road.benchmark.sets.residual import ResidualModel, align_drives
 from probe2road.errors import OptionError, OutputError
+from probe2road.io import atomic
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path
 from probe2road.io.graph_files import read_graph, write_graph
@@ -117,7 +118,8 @@ def test_a_run_killed_as_it_joins_ends_the_same(fork, recorded, tmp_path, monkey
     with pytest.raises(KilledError):
         record_fleet(fork, folder, n_drives=8, seed=4, residual=ALIGNED)
     monkeypatch.setattr(module, "write_graph", write_graph)
-    (folder / ".poses.parquet.k1ll3d").mkdir()  # what a kill leaves in place of an exception
+    left = f".poses.parquet.{atomic._HOST}-{10**8}-k1ll3d.p2r-part"  # of a process that cannot be alive
+    (folder / left).mkdir()  # what a kill leaves in place of an exception
     assert contents(record_fleet(fork, folder, n_drives=8, seed=4, residual=ALIGNED)) == contents(recorded)
     assert not [path for path in folder.iterdir() if path.name.startswith(".")]
 

@@ -77,7 +77,7 @@ def test_a_variant_takes_the_probability_and_scores_like_the_base_with_its_optio
     base = score_cells(source, BASE)[-1]
     monkeypatch.setattr("probe2road.segmentation.probability.predict_window", None)
     own = read_weights(BASE.weights).info.threshold
-    same = replace(vary("threshold-0.2", {"network": {"threshold": own, "seed_threshold": own}}), name="ablations/same")
+    same = replace(vary("threshold-0.2", {"mask": {"threshold": own, "seed_threshold": own}}), name="ablations/same")
     build_cell(source, same, like=BASE)
     (cell,) = score_cells(source, same)
     assert cell.key["options"] != base.key["options"]
