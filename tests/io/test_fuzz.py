@@ -2,31 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import random
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
-TOOL = Path(__file__).parents[2] / "tools" / "fuzz.py"
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # the worker, a process of its own, imports it by name
 INPUTS = 100
 
-
-def _loaded() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("probe2road_fuzz", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-fuzz: Any = _loaded()
+fuzz: Any = importlib.import_module("fuzz")
 
 
 @pytest.fixture(scope="module")
