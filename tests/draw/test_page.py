@@ -19,8 +19,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.image import imread
+from PIL import Image
 
-from probe2road.draw.page import write_page
+from probe2road.draw.page import _indexed_png, write_page
 from probe2road.errors import OptionError, OutputError
 from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
@@ -94,6 +95,19 @@ def test_densities_lie_where_the_traces_are(graph: RoadGraph, fleet: Fleet, tmp_
     start = data["edges"]["features"][0]["geometry"]["coordinates"][0]
     assert abs(lon - start[0]) < 1.0 / 83000  # 1 m, the resolution
     assert abs(lat - start[1]) < 1.0 / 111000
+
+
+def test_a_density_image_has_the_palette_colour_of_every_index(tmp_path: Path) -> None:
+    """Opaque or not, each pixel is what its index says."""
+    rng = np.random.default_rng(0)
+    index = rng.integers(0, 256, (37, 53)).astype(np.uint8)
+    palette, opacity = rng.integers(0, 256, (256, 3)).astype(np.uint8), rng.integers(0, 256, 256).astype(np.uint8)
+    (tmp_path / "image.png").write_bytes(_indexed_png(index, palette, opacity))
+    with Image.open(tmp_path / "image.png") as image:
+        assert (image.mode, image.size) == ("P", (53, 37))
+        assert (np.asarray(image) == index).all()
+        colours = np.asarray(image.convert("RGBA"))
+    assert (colours == np.column_stack([palette, opacity])[index]).all()
 
 
 def test_the_title_cannot_break_out_of_the_page(graph: RoadGraph, tmp_path: Path) -> None:

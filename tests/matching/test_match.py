@@ -180,6 +180,16 @@ def test_a_stretch_off_the_network_parts_the_path() -> None:
     assert turn_counts(found, graph).empty
 
 
+def test_a_fix_near_an_edge_that_it_does_not_drive_says_so() -> None:
+    """A trace that runs along the edge, jumps 50 m off it, and back: near all the time, matched at both ends."""
+    places = along((10, 0), (590, 0))
+    places[20:40, 1] = 59.0
+    found = match(graph_from_lines([[(0, 0), (600, 0)]], crs=CRS), fleet(places), options=MatchOptions(profile="fleet"))
+    missed = found.fixes["edge"].isna()
+    assert missed.sum() >= 10
+    assert found.fixes["reason"][missed].eq("edges near, but none fits").all()
+
+
 def test_a_trace_without_an_edge_near() -> None:
     graph = graph_from_lines([[(0, 0), (100, 0)]], crs=CRS)
     for profile, words in (("fleet", "within 60 m"), ("sparse", "within 80 m"), ("published", "within 150 m")):

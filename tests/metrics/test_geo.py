@@ -229,3 +229,33 @@ def test_optimal_matching_has_as_many_pairs_as_scipy_finds(seed):
     assert len(set(partner[matched])) == len(matched)
     links = csr_array((np.ones(len(a)), (a, b)), shape=shape)
     assert len(matched) == (maximum_bipartite_matching(links, perm_type="column") >= 0).sum()
+
+
+@pytest.mark.parametrize("order", ["up", "down", "shuffled"])
+@pytest.mark.parametrize("last", ["kept", "missing"])
+def test_optimal_matching_of_a_long_chain_is_found_and_takes_no_minutes(order: str, last: str) -> None:
+    """Each ``a`` is linked to two neighbours; in some orders the last one moves all others on, in others nothing can.
+
+    Without its last ``b``, the chain is short of one partner.
+    """
+    n = 100_000
+    rng = np.random.default_rng(0)
+    step = {"up": np.arange(n), "down": np.arange(n)[::-1], "shuffled": rng.permutation(n)}[order]
+    a, b = np.concatenate([np.arange(n), np.arange(1, n)]), np.concatenate([np.arange(n), np.arange(n - 1)])
+    kept = b < n - 1 if last == "missing" else np.ones(len(b), bool)
+    a, b = step[a[kept]], b[kept]
+    rows = np.lexsort((b, a))
+    partner = match_one_to_one((a[rows], b[rows], np.zeros(len(rows))), (n, n), how="optimal")
+    matched = np.flatnonzero(partner >= 0)
+    assert len(matched) == n - (last == "missing")
+    assert len(np.unique(partner[matched])) == len(matched)
+    assert np.isin(n * matched + partner[matched], n * a + b).all()
+
+
+def test_optimal_matching_moves_a_whole_chain_on() -> None:
+    """Every ``a`` but the last can take its own ``b`` or the next; the last can take the first only."""
+    n = 100_000
+    a = np.append(np.repeat(np.arange(n - 1), 2), n - 1)
+    b = np.append((np.repeat(np.arange(n - 1), 2) + np.tile([0, 1], n - 1)), 0)
+    partner = match_one_to_one((a, b, np.zeros(len(a))), (n, n), how="optimal")
+    assert partner.tolist() == [*range(1, n), 0]

@@ -4,8 +4,9 @@ import pytest
 
 from probe2road.errors import CRSError, InputError
 from probe2road.fleet.contract import Fleet, TraceGaps, fleet_from_tables
-from probe2road.raster.counts import fleet_grid, rasterize, rasterize_windows
+from probe2road.raster.counts import count_pixels, fleet_grid, rasterize, rasterize_windows
 from probe2road.raster.grid import Grid
+from probe2road.raster.lines import draw_lines
 
 CRS = "EPSG:32616"
 ORIGIN = np.array([446000.0, 4636000.0])
@@ -118,3 +119,27 @@ def test_the_grid_must_be_in_the_fleets_crs():
     fleet = fleet_of([(0, 0)])
     with pytest.raises(CRSError, match="to_crs"):
         rasterize(fleet, Grid(0.0, 0.0, 1.0, 1, 1, fleet.to_crs("EPSG:32617").crs))
+
+
+@pytest.mark.parametrize("width", [1, 2, 3, 4])
+def test_a_mask_has_the_pixels_that_are_counted_widened(width):
+    """Short and long lines, many of them across the border or outside."""
+    rng = np.random.default_rng(width)
+    row, col = rng.integers(-40, 70, (2, 400))
+    owner = np.sort(rng.integers(0, 150, 400))
+    breaks = np.diff(owner, prepend=-1) > 0
+    none = np.zeros(0, np.int64)
+    margin = 5  # so that lines outside the mask that reach into it are counted
+    wider = (30 + 2 * margin, 20 + 2 * margin)
+    counts = count_pixels(row + margin, col + margin, breaks, none, none, none, wider)[0]
+    alone = breaks & np.append(breaks[1:], True)
+    for r, c in zip(row[alone] + margin, col[alone] + margin, strict=True):
+        if 0 <= r < wider[0] and 0 <= c < wider[1]:
+            counts[r, c] -= 1
+    before, after = width // 2, (width - 1) // 2
+    expected = np.zeros((30, 20), np.uint8)
+    for down in range(-before, after + 1):
+        for right in range(-before, after + 1):
+            top, left = margin - down, margin - right
+            expected |= (counts[top : top + 30, left : left + 20] > 0).astype(np.uint8)
+    np.testing.assert_array_equal(draw_lines(row, col, owner, (30, 20), width=width), expected)

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import base64
 import html
+import io
 import json
 import logging
 import re
-import struct
-import zlib
 from importlib import resources
 from os import PathLike
 from typing import Any
@@ -22,6 +21,7 @@ import geopandas as gpd
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from PIL import Image
 from pyproj import CRS
 
 from probe2road.crs import WGS84, crs_title, transform
@@ -331,20 +331,8 @@ def _density_image(counts: NDArray[np.uint32], light: tuple[int, ...], dark: tup
 
 def _indexed_png(index: NDArray[np.uint8], palette: NDArray[np.uint8], opacity: NDArray[np.uint8]) -> bytes:
     """Encode an image of palette indices, shape ``(rows, cols)``, with a palette ``(256, 3)`` and its opacity."""
-
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-    rows, cols = index.shape
-    header = struct.pack(">IIBBBBB", cols, rows, 8, 3, 0, 0, 0)  # 8 bits, palette, no interlace
-    lines = np.zeros((rows, cols + 1), np.uint8)  # every row starts with its filter type, 0
-    lines[:, 1:] = index
-    body = zlib.compress(lines.tobytes(), 6)
-    parts = [
-        (b"IHDR", header),
-        (b"PLTE", palette.tobytes()),
-        (b"tRNS", opacity.tobytes()),
-        (b"IDAT", body),
-        (b"IEND", b""),
-    ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(kind, part) for kind, part in parts)
+    image = Image.fromarray(index)
+    image.putpalette(palette.tobytes())
+    png = io.BytesIO()
+    image.save(png, "PNG", transparency=opacity.tobytes())
+    return png.getvalue()

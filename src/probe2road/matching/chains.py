@@ -12,9 +12,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from probe2road.matching.candidates import nearest_on_edge, new_scratch
-from probe2road.matching.network import Follow, States
+from probe2road.matching.network import States
 from probe2road.matching.routes import Labels, new_labels
-from probe2road.matching.viterbi import Candidates, Observations, Parameters, decide, find_candidates, shortest
+from probe2road.matching.viterbi import Candidates, Problem, decide, find_candidates, shortest
 
 __all__ = ["Paths", "match_over_routes"]
 
@@ -56,10 +56,9 @@ class _Steps(NamedTuple):
 
 
 @njit(cache=True)
-def match_over_routes(
-    states: States, follow: Follow, observed: Observations, starts: NDArray[np.int64], parameters: Parameters
-) -> Paths:
+def match_over_routes(problem: Problem, starts: NDArray[np.int64]) -> Paths:
     """Match all traces; trace i has the fixes ``starts[i]`` to ``starts[i + 1]``."""
+    states, observed = problem.states, problem.observed
     n_fixes = len(observed.x)
     paths = Paths(
         np.full(n_fixes, -1, np.int64),
@@ -71,14 +70,13 @@ def match_over_routes(
         np.empty(0, np.int64),
         np.empty(0, np.bool_),
     )
-    steps = _Steps([0 for _ in range(0)], [0 for _ in range(0)], [0 for _ in range(0)], [False for _ in range(0)])
+    steps = _no_steps()
     scratch = new_scratch(len(states.x))
     labels = new_labels(len(states.head))
-    number = 0
     for trace in range(len(starts) - 1):
         keys = starts[trace] + np.flatnonzero(observed.key[starts[trace] : starts[trace + 1]])
-        candidates = find_candidates(states, observed, keys, parameters, scratch)
-        decision, number = decide(states, follow, observed, keys, candidates, parameters, labels, number)
+        candidates = find_candidates(problem, keys, scratch)
+        decision = decide(problem, candidates, labels)
         part = -1
         for k in range(len(keys)):
             stop = keys[k + 1] if k + 1 < len(keys) else starts[trace + 1]
@@ -87,20 +85,7 @@ def match_over_routes(
             if chosen < 0:
                 continue
             if decision.linked[k]:
-                number = _follow_route(
-                    states,
-                    follow,
-                    observed,
-                    keys,
-                    k,
-                    candidates,
-                    decision.chosen,
-                    parameters,
-                    labels,
-                    number,
-                    steps,
-                    paths,
-                )
+                _follow_route(problem, candidates, decision.chosen, k, labels, steps, paths)
             else:
                 part += 1
                 steps.state.append(candidates.state[chosen])
@@ -109,12 +94,22 @@ def match_over_routes(
                 steps.entered.append(False)
             _place(paths, keys[k], len(steps.state) - 1, candidates.along[chosen], candidates.distance[chosen])
             if k + 1 == len(keys) or not decision.linked[k + 1]:
-                _place_behind(states, observed, keys[k] + 1, stop, parameters.radius, steps, paths)
+                _place_behind(problem, keys[k] + 1, stop, steps, paths)
     return Paths(
         paths.step, paths.along, paths.distance, paths.near,
         np.array(steps.state, np.int64), np.array(steps.trace, np.int64),
         np.array(steps.part, np.int64), np.array(steps.entered, np.bool_),
     )  # fmt: skip
+
+
+@njit(cache=True)
+def _no_steps() -> _Steps:
+    """Return empty lists.
+
+    The comprehensions, which tell the compiler their types, stand apart, because numba drops writes to the arrays of a
+    local named tuple, as in ``paths.near[fix] = True``, from a function that holds one.
+    """
+    return _Steps([0 for _ in range(0)], [0 for _ in range(0)], [0 for _ in range(0)], [False for _ in range(0)])
 
 
 @njit(cache=True, inline="always")
@@ -124,15 +119,14 @@ def _place(paths: Paths, fix: int, step: int, along: float, distance: float) -> 
 
 @njit(cache=True)
 def _follow_route(
-    states: States, follow: Follow, observed: Observations, keys: NDArray[np.int64], k: int,
-    candidates: Candidates, chosen: NDArray[np.int64], parameters: Parameters, labels: Labels, number: int,
+    problem: Problem, candidates: Candidates, chosen: NDArray[np.int64], k: int, labels: Labels,
     steps: _Steps, paths: Paths,
-) -> int:  # fmt: skip
+) -> None:  # fmt: skip
     """Append the steps from the key before to key k, and place the fixes between them on the way."""
+    states, observed = problem.states, problem.observed
     source, target = chosen[k - 1], chosen[k]
-    number, stays = shortest(states, follow, observed, keys, k, candidates, source, target, parameters, labels, number)
     first = len(steps.state) - 1
-    if not stays:
+    if not shortest(problem, candidates, k, source, target, labels):
         route = [candidates.state[target]]
         while labels.before[route[-1]] >= 0:
             route.append(labels.before[route[-1]])
@@ -144,7 +138,7 @@ def _follow_route(
     begin, end = candidates.along[source], candidates.along[target]
     last = len(steps.state) - 1
     reached = first
-    for fix in range(keys[k - 1] + 1, keys[k]):
+    for fix in range(candidates.fix[k - 1] + 1, candidates.fix[k]):
         best, best_along, best_step = np.inf, begin, reached
         for step in range(reached, last + 1):
             low, high = _driven_span(states, steps.state[step], begin, end, step == first, step == last)
@@ -155,7 +149,6 @@ def _follow_route(
                 best, best_along, best_step = distance, along, step
         reached = best_step
         _place(paths, fix, best_step, best_along, best)
-    return number
 
 
 @njit(cache=True, inline="always")
@@ -174,10 +167,9 @@ def _driven_span(
 
 
 @njit(cache=True)
-def _place_behind(
-    states: States, observed: Observations, start: int, stop: int, radius: float, steps: _Steps, paths: Paths
-) -> None:
+def _place_behind(problem: Problem, start: int, stop: int, steps: _Steps, paths: Paths) -> None:
     """Place the fixes behind the last key fix of a part on its last edge, where they are within the radius."""
+    states, observed, radius = problem.states, problem.observed, problem.parameters.radius
     step = len(steps.state) - 1
     edge = steps.state[step] >> 1
     for fix in range(start, stop):

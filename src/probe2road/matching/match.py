@@ -27,7 +27,7 @@ from probe2road.matching.network import States, build_follow, build_states, edge
 from probe2road.matching.observe import observe, sampling_interval, seconds
 from probe2road.matching.published import match_published
 from probe2road.matching.tables import fix_table, joined_paths, step_rows, step_table, with_strays
-from probe2road.matching.viterbi import parameters
+from probe2road.matching.viterbi import Problem, parameters
 from probe2road.notebook import figures_table
 from probe2road.options import checked
 
@@ -245,7 +245,7 @@ def _match_profile(
     model = options.sparse if name == "sparse" else options.fleet
     follow = build_follow(states, weight, uturn_cost=model.uturn_cost, turn_cost=model.turn_cost)
     observed = observe(fleet, seconds(fleet), states, model)
-    return match_over_routes(states, follow, observed, fleet.starts, parameters(model))
+    return match_over_routes(Problem(states, follow, observed, parameters(model)), fleet.starts)
 
 
 def _radius(name: str, options: MatchOptions) -> float:

@@ -89,6 +89,15 @@ class Follow(NamedTuple):
     cost: NDArray[np.float64]
 
 
+class _EndDirections(NamedTuple):
+    """Unit directions in which directed edges start (first) and end (last), shape (D,) each; 0 without length."""
+
+    first_dx: NDArray[np.float64]
+    first_dy: NDArray[np.float64]
+    last_dx: NDArray[np.float64]
+    last_dy: NDArray[np.float64]
+
+
 def build_states(graph: RoadGraph, *, respect_oneway: bool = True) -> States:
     """Turn a road graph into the states of map matching.
 
@@ -169,21 +178,15 @@ def build_follow(states: States, weight: NDArray[np.float64], *, uturn_cost: flo
     uturn_cost, turn_cost
         See `probe2road.matching.models.RouteModel`.
     """
-    first_dx, first_dy, last_dx, last_dy = _end_directions(states)
     n_nodes = len(states.out_first) - 1
     largest = np.zeros(n_nodes)
     np.maximum.at(largest, states.tail, np.repeat(weight, 2))
     entry = -np.log(np.repeat(weight, 2) / largest[states.tail])
-    return Follow(
-        *_follow(
-            states.head, states.allowed, states.out_first, states.out, entry,
-            first_dx, first_dy, last_dx, last_dy, uturn_cost, turn_cost,
-        )
-    )  # fmt: skip
+    return _follow(states, entry, _end_directions(states), uturn_cost, turn_cost)
 
 
-def _end_directions(states: States) -> tuple[NDArray[np.float64], ...]:
-    """Return the unit directions in which directed edges start and end, shape (D,) each; 0 without length.
+def _end_directions(states: States) -> _EndDirections:
+    """Return the unit directions in which directed edges start and end; 0 without length.
 
     Those of their first and last piece, however short: the costs of turns are fitted to these, not to `RoadGraph.ends`.
     """
@@ -191,7 +194,7 @@ def _end_directions(states: States) -> tuple[NDArray[np.float64], ...]:
     n_edges = len(states.length)
     result = [np.zeros(2 * n_edges) for _ in range(4)]
     if not len(solid):
-        return tuple(result)
+        return _EndDirections(*result)
     lows = np.searchsorted(solid, states.piece_first[:-1])
     highs = np.searchsorted(solid, states.piece_first[1:])
     has = highs > lows
@@ -201,23 +204,16 @@ def _end_directions(states: States) -> tuple[NDArray[np.float64], ...]:
         end = np.where(has, step[last] / states.size[last], 0.0)
         result[axis][0::2], result[axis][1::2] = begin, -end
         result[axis + 2][0::2], result[axis + 2][1::2] = end, -begin
-    return tuple(result)
+    return _EndDirections(*result)
 
 
 @njit(cache=True)
 def _follow(
-    head: NDArray[np.int64],
-    allowed: NDArray[np.bool_],
-    out_first: NDArray[np.int64],
-    out: NDArray[np.int64],
-    entry: NDArray[np.float64],
-    first_dx: NDArray[np.float64],
-    first_dy: NDArray[np.float64],
-    last_dx: NDArray[np.float64],
-    last_dy: NDArray[np.float64],
-    uturn_cost: float,
-    turn_cost: float,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    states: States, entry: NDArray[np.float64], directions: _EndDirections, uturn_cost: float, turn_cost: float
+) -> Follow:
+    """List the successors; ``entry``, shape (D,), is the cost of entering a directed edge, the turn not included."""
+    head, allowed, out_first, out = states.head, states.allowed, states.out_first, states.out
+    first_dx, first_dy, last_dx, last_dy = directions
     n_states = len(head)
     first = np.zeros(n_states + 1, np.int64)
     for d in range(n_states):
@@ -242,7 +238,7 @@ def _follow(
             if other == d ^ 1:
                 cost[place] += uturn_cost if high - low > 1 else uturn_cost / 2.0
             place += 1
-    return first, state, cost
+    return Follow(first, state, cost)
 
 
 def _build_grid(

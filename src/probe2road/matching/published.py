@@ -81,9 +81,7 @@ def match_published(fleet: Fleet, states: States, weight: NDArray[np.float64], m
             memory=int(model.memory),
         )
     log_emission = np.log(emission_table(model))
-    return Paths(
-        *_match(states, np.log(_shares(states, weight)), log_emission, x, y, fleet.starts, model.step, numbers)
-    )
+    return _match(states, np.log(_shares(states, weight)), log_emission, x, y, fleet.starts, model.step, numbers)
 
 
 def _shares(states: States, weight: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -136,11 +134,8 @@ def _may_turn_back(states: States, d: int) -> bool:
 def _match(
     states: States, log_share: NDArray[np.float64], log_emission: NDArray[np.float64],
     x: NDArray[np.float64], y: NDArray[np.float64], starts: NDArray[np.int64], step: float, numbers: _Numbers,
-) -> tuple[
-    NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_],
-    NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_],
-]:  # fmt: skip
-    """Match all traces; the result is that of `Paths`."""
+) -> Paths:  # fmt: skip
+    """Match all traces."""
     n_fixes = len(x)
     fix_step = np.full(n_fixes, -1, np.int64)
     along, distance = np.full(n_fixes, np.nan), np.full(n_fixes, np.nan)
@@ -180,7 +175,7 @@ def _match(
             for c in range(n_points):
                 if states.edge[scratch.point[c]] == edge and not scratch.distance[c] >= distance[i]:
                     along[i], distance[i] = scratch.along[c], scratch.distance[c]
-    return (
+    return Paths(
         fix_step, along, distance, near,
         np.array(step_state, np.int64), np.array(step_trace, np.int64),
         np.array(step_part, np.int64), np.array(step_entered, np.bool_),

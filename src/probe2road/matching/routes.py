@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from probe2road.matching.network import Follow, States
 
-__all__ = ["Labels", "new_labels", "search"]
+__all__ = ["Labels", "RouteQuery", "new_labels", "search"]
 
 
 class Labels(NamedTuple):
@@ -27,6 +27,7 @@ class Labels(NamedTuple):
 
     ``stamp`` is the search that wrote a label, ``key`` and ``driven`` (m) are what it found at the start of the
     edge, ``before`` the directed edge it came from (-1: the first), ``wanted`` the search that asks for the edge.
+    ``number`` is that of the last search, shape (1,); who searches counts it up first.
     """
 
     stamp: NDArray[np.int64]
@@ -34,6 +35,29 @@ class Labels(NamedTuple):
     driven: NDArray[np.float64]
     before: NDArray[np.int64]
     wanted: NDArray[np.int64]
+    number: NDArray[np.int64]
+
+
+class RouteQuery(NamedTuple):
+    """Where routes begin, and how far they matter.
+
+    Attributes
+    ----------
+    origin, rest
+        Directed edge of the point where they begin, and distance (m) from it to the end of this edge.
+    beta
+        Metres that a cost of one is worth.
+    limit
+        Largest key.
+    n_wanted
+        How many directed edges are asked for: those whose ``wanted`` is the number of the search.
+    """
+
+    origin: int
+    rest: float
+    beta: float
+    limit: float
+    n_wanted: int
 
 
 @njit(cache=True)
@@ -45,35 +69,18 @@ def new_labels(n_states: int) -> Labels:
         np.empty(n_states),
         np.empty(n_states, np.int64),
         np.full(n_states, -1, np.int64),
+        np.zeros(1, np.int64),
     )
 
 
 @njit(cache=True)
-def search(
-    states: States, follow: Follow, origin: int, rest: float, beta: float, limit: float,
-    labels: Labels, number: int, n_wanted: int,
-) -> None:  # fmt: skip
-    """Label the starts of directed edges by the best route from a point on another.
-
-    Parameters
-    ----------
-    states, follow
-        The network.
-    origin, rest
-        Directed edge of the point, and distance (m) from it to the end of this edge.
-    beta
-        Metres that a cost of one is worth.
-    limit
-        Largest key.
-    labels, number
-        Labels, and the number of this search; edges whose ``wanted`` is this number are asked for.
-    n_wanted
-        How many they are.
-    """
-    if rest > limit:
+def search(states: States, follow: Follow, query: RouteQuery, labels: Labels) -> None:
+    """Label the starts of directed edges by the best route from a point on another, in the network given first."""
+    if query.rest > query.limit:
         return
     heap = [(0.0, 0) for _ in range(0)]
-    _relax(follow, origin, -1, rest, rest, beta, limit, labels, number, heap)
+    number, n_wanted = labels.number[0], query.n_wanted
+    _relax(follow, query, query.origin, (-1, query.rest, query.rest), labels, heap)
     while len(heap) > 0 and n_wanted > 0:
         key, d = heappop(heap)
         if key > labels.key[d]:
@@ -81,19 +88,21 @@ def search(
         if labels.wanted[d] == number:
             n_wanted -= 1
         length = states.length[d >> 1]
-        _relax(follow, d, d, key + length, labels.driven[d] + length, beta, limit, labels, number, heap)
+        _relax(follow, query, d, (d, key + length, labels.driven[d] + length), labels, heap)
 
 
 @njit(cache=True, inline="always")
 def _relax(
-    follow: Follow, d: int, before: int, key: float, driven: float, beta: float, limit: float,
-    labels: Labels, number: int, heap: list[tuple[float, int]],
+    follow: Follow, query: RouteQuery, d: int, label: tuple[int, float, float], labels: Labels,
+    heap: list[tuple[float, int]],
 ) -> None:  # fmt: skip
-    """Label the successors of a directed edge that ends at this key and length, where that is an improvement."""
+    """Give the successors of a directed edge the label (before, key, driven) of its end, where that is better."""
+    before, key, driven = label
+    number = labels.number[0]
     for k in range(follow.first[d], follow.first[d + 1]):
         other = follow.state[k]
-        value = key + beta * follow.cost[k]
-        if value <= limit and (labels.stamp[other] != number or value < labels.key[other]):
+        value = key + query.beta * follow.cost[k]
+        if value <= query.limit and (labels.stamp[other] != number or value < labels.key[other]):
             labels.stamp[other] = number
             labels.key[other] = value
             labels.driven[other] = driven

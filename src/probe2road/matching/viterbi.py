@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from probe2road.matching.candidates import Scratch, altitude_at, nearest_points
 from probe2road.matching.models import RouteModel
 from probe2road.matching.network import Follow, States
-from probe2road.matching.routes import Labels, search
+from probe2road.matching.routes import Labels, RouteQuery, search
 
 __all__ = [
     "JUMP",
@@ -36,6 +36,7 @@ __all__ = [
     "Decision",
     "Observations",
     "Parameters",
+    "Problem",
     "decide",
     "find_candidates",
     "parameters",
@@ -80,18 +81,43 @@ class Observations(NamedTuple):
     key: NDArray[np.bool_]
 
 
+class Problem(NamedTuple):
+    """What is given: a network, the fixes of all traces, and the numbers of the model."""
+
+    states: States
+    follow: Follow
+    observed: Observations
+    parameters: Parameters
+
+
 class Candidates(NamedTuple):
     """Candidates of the key fixes of one trace; those of key k are ``first[k]`` to ``first[k + 1]``.
 
-    ``along`` is the offset from u (m), ``progress`` that from the start of the directed edge, ``cost`` the emission.
+    ``fix`` is the row of each key fix in the observations, ``along`` the offset from u (m), ``progress`` that from the
+    start of the directed edge, ``cost`` the emission.
     """
 
+    fix: NDArray[np.int64]
     first: NDArray[np.int64]
     state: NDArray[np.int64]
     along: NDArray[np.float64]
     progress: NDArray[np.float64]
     distance: NDArray[np.float64]
     cost: NDArray[np.float64]
+
+
+class _Scores(NamedTuple):
+    """Of every candidate: the cost of the best chain that ends there, and the candidate before, `JUMP` or `NULL`."""
+
+    score: NDArray[np.float64]
+    back: NDArray[np.int64]
+
+
+class _Gap(NamedTuple):
+    """From one key fix to the next: the straight line (m), and how many metres a cost of one is worth."""
+
+    straight: float
+    beta: float
 
 
 class Decision(NamedTuple):
@@ -118,10 +144,9 @@ def parameters(model: RouteModel) -> Parameters:
 
 
 @njit(cache=True)
-def find_candidates(
-    states: States, observed: Observations, keys: NDArray[np.int64], parameters: Parameters, scratch: Scratch
-) -> Candidates:
+def find_candidates(problem: Problem, keys: NDArray[np.int64], scratch: Scratch) -> Candidates:
     """Find the candidates of key fixes, given as rows of the observations, and the costs of their emissions."""
+    states, _, observed, parameters = problem
     n_keys = len(keys)
     first = np.zeros(n_keys + 1, np.int64)
     size = 16 * n_keys + 16
@@ -145,18 +170,16 @@ def find_candidates(
                 numbers[0, count] = along
                 numbers[1, count] = states.length[d >> 1] - along if reverse else along
                 numbers[2, count] = distance
-                numbers[3, count] = _emission(states, observed, i, p, along, distance, reverse, parameters)
+                numbers[3, count] = _emission(problem, i, p, along, distance, reverse)
                 count += 1
         first[k + 1] = count
-    return Candidates(first, state, numbers[0], numbers[1], numbers[2], numbers[3])
+    return Candidates(keys, first, state, numbers[0], numbers[1], numbers[2], numbers[3])
 
 
 @njit(cache=True)
-def _emission(
-    states: States, observed: Observations, i: int, p: int, along: float, distance: float, reverse: int,
-    parameters: Parameters,
-) -> float:  # fmt: skip
+def _emission(problem: Problem, i: int, p: int, along: float, distance: float, reverse: int) -> float:
     """Return the cost of seeing a fix from a point: of its distance, its course and its altitude."""
+    states, _, observed, parameters = problem
     ratio = distance / observed.sigma[i]
     cost = 0.5 * (parameters.tail + 1.0) * np.log1p(ratio * ratio / parameters.tail)
     if observed.kappa[i] > 0 and states.size[p] > 0:
@@ -170,16 +193,14 @@ def _emission(
 
 
 @njit(cache=True)
-def decide(
-    states: States, follow: Follow, observed: Observations, keys: NDArray[np.int64], candidates: Candidates,
-    parameters: Parameters, labels: Labels, number: int,
-) -> tuple[Decision, int]:  # fmt: skip
-    """Find the most likely chain of candidates; ``number`` is that of the last search, and so is the result's."""
-    n_keys = len(keys)
-    back = np.full(len(candidates.state), NULL, np.int64)
+def decide(problem: Problem, candidates: Candidates, labels: Labels) -> Decision:
+    """Find the most likely chain of candidates."""
+    parameters = problem.parameters
+    n_keys = len(candidates.fix)
+    scores = _Scores(np.empty(len(candidates.state)), np.full(len(candidates.state), NULL, np.int64))
+    score, back = scores
     null_back = np.full(n_keys, NULL, np.int64)  # best candidate before, or NULL
     best = np.full(n_keys, NULL, np.int64)
-    score = np.empty(len(candidates.state))
     null_score = 0.0
     for k in range(n_keys):
         low, high = candidates.first[k], candidates.first[k + 1]
@@ -191,9 +212,7 @@ def decide(
             score[c] = floor
             back[c] = JUMP if jump < enter else NULL
         if k > 0:
-            number = _advance(
-                states, follow, observed, keys, k, candidates, parameters, labels, number, floor, score, back
-            )
+            _advance(problem, candidates, k, floor, scores, labels)
         leave = score[before] + parameters.break_cost / 2.0 if before >= 0 else np.inf
         null_back[k] = before if leave <= null_score else NULL
         null_score = min(null_score, leave) + parameters.null_cost
@@ -212,26 +231,23 @@ def decide(
         else:
             linked[k] = back[here] >= 0
             here = best[k - 1] if back[here] == JUMP else back[here]
-    return Decision(chosen, linked), number
+    return Decision(chosen, linked)
 
 
 @njit(cache=True)
-def _advance(
-    states: States, follow: Follow, observed: Observations, keys: NDArray[np.int64], k: int,
-    candidates: Candidates, parameters: Parameters, labels: Labels, number: int,
-    floor: float, score: NDArray[np.float64], back: NDArray[np.int64],
-) -> int:  # fmt: skip
+def _advance(problem: Problem, candidates: Candidates, k: int, floor: float, scores: _Scores, labels: Labels) -> None:
     """Improve the scores of the candidates of key k over routes from those of the key before.
 
     Sources are taken from the best on. A target is of no use any more where its score, its emission included,
     exceeds that of the best target by a jump: from the next key on, the jump is at least as good. ``cap`` is the
     score that a target must stay below, so the searches of the later sources are short.
     """
-    i, j = keys[k - 1], keys[k]
-    straight = np.hypot(observed.x[j] - observed.x[i], observed.y[j] - observed.y[i])
+    states, follow, _, parameters = problem
+    score, back = scores
+    gap = _gap_before(problem, candidates, k)
+    straight, beta = gap
     if straight > parameters.max_step:
-        return number
-    beta = parameters.beta + parameters.beta_rate * (observed.t[j] - observed.t[i])
+        return
     low, start = candidates.first[k], candidates.first[k - 1]
     targets = np.arange(low, candidates.first[k + 1])
     n_targets = len(targets)
@@ -239,7 +255,8 @@ def _advance(
     for rank in np.argsort(score[start:low], kind="mergesort"):
         source = start + rank
         base = score[source]
-        number += 1
+        labels.number[0] += 1
+        number = labels.number[0]
         origin = candidates.state[source]
         rest = states.length[origin >> 1] - candidates.progress[source]
         limit, n_wanted, kept = 0.0, 0, 0
@@ -251,7 +268,7 @@ def _advance(
             targets[kept] = c
             kept += 1
             if candidates.state[c] == origin:
-                cap = min(cap, base + _stay(candidates, source, c, straight, beta))
+                cap = min(cap, base + _stay(candidates, source, c, gap))
             reach = straight + beta * (cap - base)
             if rest + candidates.progress[c] <= reach:  # else no route over the end of the edge is short enough
                 limit = max(limit, reach - candidates.progress[c])
@@ -261,56 +278,58 @@ def _advance(
         if n_targets == 0:
             break
         if n_wanted > 0:
-            search(states, follow, origin, rest, beta, limit, labels, number, n_wanted)
+            search(states, follow, RouteQuery(origin, rest, beta, limit, n_wanted), labels)
         for place in range(n_targets):
             c = targets[place]
-            cost = base + _route(candidates, source, c, straight, beta, labels, number)[0]
+            cost = base + _route(candidates, source, c, gap, labels)[0]
             if cost < score[c]:
                 score[c], back[c] = cost, source
                 lowest = min(lowest, cost + candidates.cost[c])
-    return number
+
+
+@njit(cache=True)
+def _gap_before(problem: Problem, candidates: Candidates, k: int) -> _Gap:
+    """Measure from the key fix before to key k."""
+    observed, parameters = problem.observed, problem.parameters
+    i, j = candidates.fix[k - 1], candidates.fix[k]
+    straight = np.hypot(observed.x[j] - observed.x[i], observed.y[j] - observed.y[i])
+    return _Gap(straight, parameters.beta + parameters.beta_rate * (observed.t[j] - observed.t[i]))
 
 
 @njit(cache=True, inline="always")
-def _route(
-    candidates: Candidates, source: int, target: int, straight: float, beta: float, labels: Labels, number: int
-) -> tuple[float, bool]:
+def _route(candidates: Candidates, source: int, target: int, gap: _Gap, labels: Labels) -> tuple[float, bool]:
     """Return the cost of the route between two candidates, and whether it stays on their edge."""
     d = candidates.state[target]
-    cost = _stay(candidates, source, target, straight, beta) if d == candidates.state[source] else np.inf
+    cost = _stay(candidates, source, target, gap) if d == candidates.state[source] else np.inf
     stays = cost < np.inf
-    if labels.stamp[d] == number:
+    if labels.stamp[d] == labels.number[0]:
         length = labels.driven[d] + candidates.progress[target]
-        around = (abs(length - straight) + labels.key[d] - labels.driven[d]) / beta
+        around = (abs(length - gap.straight) + labels.key[d] - labels.driven[d]) / gap.beta
         if around < cost:
             cost, stays = around, False
     return cost, stays
 
 
 @njit(cache=True, inline="always")
-def _stay(candidates: Candidates, source: int, target: int, straight: float, beta: float) -> float:
+def _stay(candidates: Candidates, source: int, target: int, gap: _Gap) -> float:
     """Return the cost of going between two candidates on one directed edge; noise may go back a little."""
     step = candidates.progress[target] - candidates.progress[source]
-    return abs(step - straight) / beta if step >= -_BACKTRACK else np.inf
+    return abs(step - gap.straight) / gap.beta if step >= -_BACKTRACK else np.inf
 
 
 @njit(cache=True)
-def shortest(
-    states: States, follow: Follow, observed: Observations, keys: NDArray[np.int64], k: int,
-    candidates: Candidates, source: int, target: int, parameters: Parameters, labels: Labels, number: int,
-) -> tuple[int, bool]:  # fmt: skip
+def shortest(problem: Problem, candidates: Candidates, k: int, source: int, target: int, labels: Labels) -> bool:
     """Search the route that `decide` found between candidates of key k - 1 and k anew, for its labels.
 
-    Returns the number of the search, and whether the route stays on one edge and needs no labels.
+    Returns whether the route stays on one edge and needs no labels.
     """
-    i, j = keys[k - 1], keys[k]
-    straight = np.hypot(observed.x[j] - observed.x[i], observed.y[j] - observed.y[i])
-    beta = parameters.beta + parameters.beta_rate * (observed.t[j] - observed.t[i])
+    gap = _gap_before(problem, candidates, k)
     origin, d = candidates.state[source], candidates.state[target]
-    cost = _stay(candidates, source, target, straight, beta) if d == origin else np.inf
-    limit = straight + beta * min(cost, parameters.break_cost) - candidates.progress[target] + 1e-3  # for rounding
-    number += 1
-    labels.wanted[d] = number
-    rest = states.length[origin >> 1] - candidates.progress[source]
-    search(states, follow, origin, rest, beta, limit, labels, number, 1)
-    return number, _route(candidates, source, target, straight, beta, labels, number)[1]
+    cost = _stay(candidates, source, target, gap) if d == origin else np.inf
+    most = min(cost, problem.parameters.break_cost)
+    limit = gap.straight + gap.beta * most - candidates.progress[target] + 1e-3  # for rounding
+    labels.number[0] += 1
+    labels.wanted[d] = labels.number[0]
+    rest = problem.states.length[origin >> 1] - candidates.progress[source]
+    search(problem.states, problem.follow, RouteQuery(origin, rest, gap.beta, limit, 1), labels)
+    return _route(candidates, source, target, gap, labels)[1]

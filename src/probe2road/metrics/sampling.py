@@ -3,9 +3,10 @@
 Strategy of `sample_around`. From each centre (a node, or a position on an edge) Dijkstra's algorithm finds the
 network distance of every node in reach. Along an edge that distance rises away from the centre, so an edge
 belongs to a branch that enters it from one end, or to two branches that enter from both ends and meet where
-their distances are equal. A branch is followed from the centre outward: its samples are the points whose
-network distance is a multiple of the spacing, and its end, which is a dead end, the place where two branches
-meet, or the radius, where the edge is cut. Thus samples depend on the shape of the roads around the centre and
+their distances are equal. A centre on an edge becomes a node first, and the edge two halves, which are edges like
+others. A branch is followed from the centre outward: its samples are the points whose network distance is a
+multiple of the spacing, and its end, which is a dead end, the place where two branches meet, or the radius,
+where the edge is cut. Thus samples depend on the shape of the roads around the centre and
 not on how edges are cut, drawn or numbered, and a stretch that two branches share is sampled once. Samples at
 nodes are recognised by the node, so that a node is sampled once however many edges meet there.
 """
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from heapq import heappop, heappush
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -151,10 +153,8 @@ def sample_around(network: Network, centres: Centres, *, radius: float, spacing:
     >>> sorted(sample_around(network, centre, radius=30.0, spacing=11.0).xy[:, 0].tolist())
     [0.0, 4.0, 15.0, 26.0, 37.0, 45.0]
     """
-    first, edge, offset = _sample_around(
-        centres.node, centres.edge, centres.offset, float(radius), float(spacing), ends,
-        network.u, network.v, network.length, network.incident_first, network.incident_edge,
-    )  # fmt: skip
+    limits = _Limits(float(radius), float(spacing), ends)
+    first, edge, offset = _sample_around(centres.node, centres.edge, centres.offset, _roads(network), limits)
     return _samples(network, first, edge, offset)
 
 
@@ -183,164 +183,252 @@ def _samples(
     return Samples(first, edge, offset, *locate(network, edge, offset))
 
 
+class _Roads(NamedTuple):
+    """Stretches of road between nodes: the edges, and behind them two halves of the edge that has the centre on it.
+
+    R = E + 2 stretches; the node behind all others is the centre on an edge, where the two halves begin.
+    """
+
+    u: NDArray[np.int64]  # (R,)
+    v: NDArray[np.int64]  # (R,)
+    edge: NDArray[np.int64]  # (R,) edge of the stretch
+    begin: NDArray[np.float64]  # (R,) m, offset on the edge at u
+    end: NDArray[np.float64]  # (R,) m, the same at v
+    incident_first: NDArray[np.int64]  # (N + 2,)
+    incident: NDArray[np.int64]  # (R * 2 - 2,) stretches at each node, ascending but for halves
+
+
+class _Reached(NamedTuple):
+    """What Dijkstra's algorithm knows of every node, shape (N + 1,) each; cleared behind each centre."""
+
+    distance: NDArray[np.float64]  # m
+    over: NDArray[np.int64]  # stretch over which the node was reached; -1 for the centre
+
+
+class _Sink(NamedTuple):
+    """Where samples go: growing lists, and the last centre for which each node was sampled, shape (N + 1,)."""
+
+    edge: list[int]
+    offset: list[float]
+    node_seen: NDArray[np.int64]
+
+
+class _Limits(NamedTuple):
+    """See `sample_around`."""
+
+    radius: float
+    spacing: float
+    ends: bool
+
+
+class _Branch(NamedTuple):
+    """A branch on one edge: it enters at an offset, at a network distance, and goes on to another distance."""
+
+    edge: int
+    offset: float  # m
+    sign: float  # of the offset, going on
+    distance: float  # m
+    stop: float  # m, network distance
+
+
+def _roads(network: Network) -> _Roads:
+    """Make room for a centre on an edge in the arrays of a network."""
+    n_edges = len(network.u)
+    spare = np.zeros(2, np.int64)
+    return _Roads(
+        u=np.concatenate([network.u, spare]),
+        v=np.concatenate([network.v, spare]),
+        edge=np.concatenate([np.arange(n_edges), spare]),
+        begin=np.zeros(n_edges + 2),
+        end=np.concatenate([network.length, spare]),
+        incident_first=np.append(network.incident_first, 2 * n_edges + 2),
+        incident=np.concatenate([network.incident_edge, [n_edges, n_edges + 1]]),
+    )
+
+
 @njit(cache=True)
 def _sample_around(
-    centre_node: NDArray[np.int64],
-    centre_edge: NDArray[np.int64],
-    centre_offset: NDArray[np.float64],
-    radius: float,
-    spacing: float,
-    ends: bool,
-    u: NDArray[np.int64],
-    v: NDArray[np.int64],
-    length: NDArray[np.float64],
-    incident_first: NDArray[np.int64],
-    incident_edge: NDArray[np.int64],
+    node: NDArray[np.int64],
+    edge: NDArray[np.int64],
+    offset: NDArray[np.float64],
+    roads: _Roads,
+    limits: _Limits,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Collect the samples of all centres; see the module for the strategy.
-
-    A centre on an edge splits it into a half towards u and a half towards v, whose other ends lie at distance 0.
-    ``parent`` holds the edge over which a node was reached: an edge, or one of the two halves.
-    """
-    n_nodes = len(incident_first) - 1
-    distance = np.full(n_nodes, np.inf)
-    parent = np.full(n_nodes, -1, np.int64)
-    edge_seen, node_seen = np.full(len(u), -1, np.int64), np.full(n_nodes, -1, np.int64)
-    edges, offsets = [0 for _ in range(0)], [0.0 for _ in range(0)]  # empty, but of a type that numba can tell
-    first = np.zeros(len(centre_node) + 1, np.int64)
-    for c in range(len(centre_node)):
-        node, e = centre_node[c], centre_edge[c]
-        at = min(max(centre_offset[c], 0.0), length[e]) if e >= 0 and node < 0 else 0.0
-        settled = _reach(node, e, at, radius, u, v, length, incident_first, incident_edge, distance, parent)
-        if node < 0 and e >= 0:
-            edge_seen[e] = c
-            edges.append(e)
-            offsets.append(at)
-            for half in range(2):
-                end, stop = (u[e], 0.0) if half == 0 else (v[e], length[e])
-                if abs(at - stop) <= EPSILON:
-                    node_seen[end] = c  # the centre is that node, and is sampled already
-                _walk(e, at, stop, 0.0, distance[end], parent[end] == -2 - half, False,
-                      radius, spacing, ends, c, u, v, length, node_seen, edges, offsets)  # fmt: skip
+    """Collect the samples of all centres, see `Centres`; the strategy stands at the head of the module."""
+    n_nodes = len(roads.incident_first) - 1
+    reached = _Reached(np.full(n_nodes, np.inf), np.full(n_nodes, -1, np.int64))
+    sink = _new_sink(n_nodes)
+    walked = np.full(len(roads.u), -1, np.int64)  # the last centre for which each stretch was sampled
+    first = np.zeros(len(node) + 1, np.int64)
+    for centre in range(len(node)):
+        on_edge = node[centre] < 0 and edge[centre] >= 0
+        root = n_nodes - 1 if on_edge else node[centre]
+        if on_edge:
+            _split(roads, edge[centre], offset[centre])
+            _sample_centre(roads, root, sink, centre)
+        settled = _reach(root, limits.radius, roads, reached)
         for n in settled:
-            level = spacing * np.round(distance[n] / spacing)
-            degree = incident_first[n + 1] - incident_first[n]
-            if abs(distance[n] - level) <= EPSILON or (ends and degree == 1 and n != node):
-                e = parent[n] if parent[n] >= 0 else (centre_edge[c] if parent[n] < -1 else -1)
-                if e < 0 and degree > 0:
-                    e = incident_edge[incident_first[n]]
-                if e >= 0 and node_seen[n] != c:
-                    node_seen[n] = c
-                    edges.append(e)
-                    offsets.append(0.0 if u[e] == n else length[e])
-            for k in range(incident_first[n], incident_first[n + 1]):
-                e = incident_edge[k]
-                if edge_seen[e] == c:
-                    continue
-                edge_seen[e] = c
-                a, b = u[e], v[e]
-                _walk(e, 0.0, length[e], distance[a], distance[b], parent[b] == e and a != b,
-                      parent[a] == e and a != b, radius, spacing, ends, c, u, v, length,
-                      node_seen, edges, offsets)  # fmt: skip
+            if _is_sample(n, root, roads, reached, limits) and sink.node_seen[n] != centre:
+                _sample_node(n, roads, reached, sink, centre)
+            for k in range(roads.incident_first[n], roads.incident_first[n + 1]):
+                stretch = roads.incident[k]
+                if walked[stretch] != centre:
+                    walked[stretch] = centre
+                    _walk(stretch, roads, reached, limits, sink, centre)
         for n in settled:
-            distance[n], parent[n] = np.inf, -1
-        first[c + 1] = len(edges)
-    return first, np.array(edges, np.int64), np.array(offsets, np.float64)
+            reached.distance[n], reached.over[n] = np.inf, -1
+        if on_edge:
+            _mend(roads)
+        first[centre + 1] = len(sink.edge)
+    return first, np.array(sink.edge, np.int64), np.array(sink.offset, np.float64)
 
 
 @njit(cache=True)
-def _reach(
-    node: int,
-    edge: int,
-    at: float,
-    radius: float,
-    u: NDArray[np.int64],
-    v: NDArray[np.int64],
-    length: NDArray[np.float64],
-    incident_first: NDArray[np.int64],
-    incident_edge: NDArray[np.int64],
-    distance: NDArray[np.float64],
-    parent: NDArray[np.int64],
-) -> list[int]:
-    """Fill the distance of every node within the radius and the edge it was reached over; list them nearest first.
+def _new_sink(n_nodes: int) -> _Sink:
+    """Return a sink without samples.
 
-    Nodes reached straight from a centre on an edge have the parent -2 (its half towards u) or -3 (towards v).
+    The comprehensions, which tell the compiler the types of empty lists, stand apart, because numba drops writes to
+    the arrays of a local named tuple, as in ``reached.distance[n] = 0.0``, from a function that holds one.
     """
+    return _Sink([0 for _ in range(0)], [0.0 for _ in range(0)], np.full(n_nodes, -1, np.int64))
+
+
+@njit(cache=True)
+def _split(roads: _Roads, edge: int, offset: float) -> None:
+    """Put the centre on an edge: its halves lead from the centre to u and to v, where they take the edge's place."""
+    offset = min(max(offset, 0.0), roads.end[edge])
+    for side in range(2):
+        half = len(roads.u) - 2 + side
+        node, stop = (roads.v[edge], roads.end[edge]) if side else (roads.u[edge], 0.0)
+        roads.u[half], roads.v[half], roads.edge[half] = len(roads.incident_first) - 2, node, edge
+        roads.begin[half], roads.end[half] = offset, stop
+        for k in range(roads.incident_first[node], roads.incident_first[node + 1]):
+            if roads.incident[k] == edge:  # a loop stands there twice, once for each half
+                roads.incident[k] = half
+                break
+
+
+@njit(cache=True)
+def _mend(roads: _Roads) -> None:
+    """Put the edge back in the place of its halves."""
+    for half in range(len(roads.u) - 2, len(roads.u)):
+        node = roads.v[half]
+        for k in range(roads.incident_first[node], roads.incident_first[node + 1]):
+            if roads.incident[k] == half:
+                roads.incident[k] = roads.edge[half]
+
+
+@njit(cache=True)
+def _sample_centre(roads: _Roads, root: int, sink: _Sink, centre: int) -> None:
+    """Sample a centre on an edge, and with it the end of the edge where it lies there."""
+    sink.node_seen[root] = centre
+    half = roads.incident[roads.incident_first[root]]
+    sink.edge.append(roads.edge[half])
+    sink.offset.append(roads.begin[half])
+    for k in range(roads.incident_first[root], roads.incident_first[root + 1]):
+        half = roads.incident[k]
+        if abs(roads.end[half] - roads.begin[half]) <= EPSILON:
+            sink.node_seen[roads.v[half]] = centre
+
+
+@njit(cache=True)
+def _reach(root: int, radius: float, roads: _Roads, reached: _Reached) -> list[int]:
+    """Fill what is known of every node within the radius of a node (-1: of none); list them nearest first."""
     heap = [(0.0, 0) for _ in range(0)]
     settled = [0 for _ in range(0)]
-    if node >= 0:
-        distance[node] = 0.0
-        heappush(heap, (0.0, node))
-    elif edge >= 0:
-        for half in range(2):
-            end, far = (u[edge], at) if half == 0 else (v[edge], length[edge] - at)
-            if far <= radius + EPSILON and far < distance[end]:
-                distance[end], parent[end] = far, -2 - half
-                heappush(heap, (far, end))
+    if root >= 0:
+        reached.distance[root] = 0.0
+        heappush(heap, (0.0, root))
     while len(heap) > 0:
         here, n = heappop(heap)
-        if here > distance[n]:
+        if here > reached.distance[n]:
             continue
         settled.append(n)
-        for k in range(incident_first[n], incident_first[n + 1]):
-            e = incident_edge[k]
-            if e == edge and node < 0:
-                continue  # that way lies the centre
-            other = v[e] if u[e] == n else u[e]
-            far = here + length[e]
-            if far <= radius + EPSILON and far < distance[other]:
-                distance[other], parent[other] = far, e
+        for k in range(roads.incident_first[n], roads.incident_first[n + 1]):
+            stretch = roads.incident[k]
+            other = roads.v[stretch] if roads.u[stretch] == n else roads.u[stretch]
+            far = here + abs(roads.end[stretch] - roads.begin[stretch])
+            if far <= radius + EPSILON and far < reached.distance[other]:
+                reached.distance[other], reached.over[other] = far, stretch
                 heappush(heap, (far, other))
     return settled
 
 
-@njit(cache=True)
-def _walk(
-    e: int,
-    a: float,
-    b: float,
-    at_a: float,
-    at_b: float,
-    a_to_b: bool,
-    b_to_a: bool,
-    radius: float,
-    spacing: float,
-    ends: bool,
-    c: int,
-    u: NDArray[np.int64],
-    v: NDArray[np.int64],
-    length: NDArray[np.float64],
-    node_seen: NDArray[np.int64],
-    edges: list[int],
-    offsets: list[float],
-) -> None:
-    """Sample the stretch of edge ``e`` from offset ``a`` to ``b``, whose ends lie at given network distances.
+@njit(cache=True, inline="always")
+def _is_sample(n: int, root: int, roads: _Roads, reached: _Reached, limits: _Limits) -> bool:
+    """Say whether a node in reach is a sample: at a multiple of the spacing, or as a dead end."""
+    level = limits.spacing * np.round(reached.distance[n] / limits.spacing)
+    dead_end = roads.incident_first[n + 1] - roads.incident_first[n] == 1 and n != root
+    return abs(reached.distance[n] - level) <= EPSILON or (limits.ends and dead_end)
 
-    ``a_to_b`` and ``b_to_a`` say that the far end is reached over this very stretch. Otherwise branches enter from
-    both ends in reach, up to where they meet or to the radius.
+
+@njit(cache=True, inline="always")
+def _sample_node(n: int, roads: _Roads, reached: _Reached, sink: _Sink, centre: int) -> None:
+    """Sample a node as an end of the edge over which it was reached; the centre as one of its first edge, if any."""
+    stretch = reached.over[n]
+    if stretch < 0:
+        if roads.incident_first[n] == roads.incident_first[n + 1]:
+            return
+        stretch = roads.incident[roads.incident_first[n]]
+    edge = roads.edge[stretch]
+    sink.node_seen[n] = centre
+    sink.edge.append(edge)
+    sink.offset.append(0.0 if roads.u[edge] == n else roads.end[edge])
+
+
+@njit(cache=True)
+def _walk(stretch: int, roads: _Roads, reached: _Reached, limits: _Limits, sink: _Sink, centre: int) -> None:
+    """Sample the branches on a stretch.
+
+    Where one end was reached over this very stretch, one branch passes through, and the node behind is sampled as a
+    node. Otherwise branches enter from both ends in reach, up to where they meet or to the radius.
     """
-    size = abs(b - a)
-    through = a_to_b or b_to_a
-    meets = not through and at_a + at_b + size <= 2.0 * radius
-    for side in range(2):
-        start, begin, sign = (a, at_a, np.sign(b - a)) if side == 0 else (b, at_b, np.sign(a - b))
-        if begin == np.inf or (through and (a_to_b != (side == 0))):
-            continue
-        stop = begin + size if through else radius
-        if meets:
-            stop = (at_a + at_b + size) / 2.0
-        level = spacing * (np.floor((begin + EPSILON) / spacing) + 1.0)
-        while level < stop - EPSILON:
-            edges.append(e)
-            offsets.append(start + sign * (level - begin))
-            level += spacing
-        if through or not ends or (meets and side == 1):
-            continue
-        end = start + sign * (stop - begin)
-        n = u[e] if end <= EPSILON else (v[e] if end >= length[e] - EPSILON else -1)
-        if n >= 0:
-            if node_seen[n] == c:
-                continue
-            node_seen[n] = c
-        edges.append(e)
-        offsets.append(end)
+    u, v, edge = roads.u[stretch], roads.v[stretch], roads.edge[stretch]
+    begin, end = roads.begin[stretch], roads.end[stretch]
+    at_u, at_v, size = reached.distance[u], reached.distance[v], abs(end - begin)
+    onward, back = np.sign(end - begin), np.sign(begin - end)
+    if u != v and reached.over[v] == stretch:
+        _sample_levels(_Branch(edge, begin, onward, at_u, at_u + size), limits.spacing, sink)
+        return
+    if u != v and reached.over[u] == stretch:
+        _sample_levels(_Branch(edge, end, back, at_v, at_v + size), limits.spacing, sink)
+        return
+    meets = at_u + at_v + size <= 2.0 * limits.radius
+    stop = (at_u + at_v + size) / 2.0 if meets else limits.radius
+    if at_u < np.inf:
+        branch = _Branch(edge, begin, onward, at_u, stop)
+        _sample_levels(branch, limits.spacing, sink)
+        if limits.ends:
+            _sample_end(branch, roads, sink, centre)
+    if at_v < np.inf:
+        branch = _Branch(edge, end, back, at_v, stop)
+        _sample_levels(branch, limits.spacing, sink)
+        if limits.ends and not meets:  # else the end is that of the other branch
+            _sample_end(branch, roads, sink, centre)
+
+
+@njit(cache=True, inline="always")
+def _sample_levels(branch: _Branch, spacing: float, sink: _Sink) -> None:
+    """Sample a branch at the multiples of the spacing, its ends not included."""
+    level = spacing * (np.floor((branch.distance + EPSILON) / spacing) + 1.0)
+    while level < branch.stop - EPSILON:
+        sink.edge.append(branch.edge)
+        sink.offset.append(branch.offset + branch.sign * (level - branch.distance))
+        level += spacing
+
+
+@njit(cache=True, inline="always")
+def _sample_end(branch: _Branch, roads: _Roads, sink: _Sink, centre: int) -> None:
+    """Sample the place where a branch ends, unless it is a node that is sampled already."""
+    offset = branch.offset + branch.sign * (branch.stop - branch.distance)
+    node = -1
+    if offset <= EPSILON:
+        node = roads.u[branch.edge]
+    elif offset >= roads.end[branch.edge] - EPSILON:
+        node = roads.v[branch.edge]
+    if node >= 0:
+        if sink.node_seen[node] == centre:
+            return
+        sink.node_seen[node] = centre
+    sink.edge.append(branch.edge)
+    sink.offset.append(offset)

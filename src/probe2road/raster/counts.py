@@ -22,6 +22,7 @@ from probe2road.crs import require_same_crs
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks, without_strays
 from probe2road.raster.grid import Grid, Window, sparse_zeros
+from probe2road.raster.lines import draw_line
 
 __all__ = [
     "CHANNELS",
@@ -40,6 +41,7 @@ logger = logging.getLogger(__name__)
 CHANNELS = ("traces", "lane_markings", "road_boundaries")  # the paper's A, B, C
 
 _CACHED_WINDOW = 1024  # pixels; three channels of one row block stay in the processor's cache
+_KEEP = np.uint32(0xFFFFFFFF)  # all bits: lines add to what is there
 
 _MOST_PIXELS = 20_000_000_000  # where the fleet drove; a byte each is all the memory of a large computer
 _LONGEST_SIDE = 2**31 - 1  # px, that a GeoTIFF can have
@@ -300,8 +302,7 @@ def _draw_segments(
 ) -> None:
     """Add the segments that end at the given fixes to counts ``(rows, cols)``, whose corner is (top, left).
 
-    A segment is drawn from its northern (then western) end, whichever way it was driven, because Bresenham's
-    choice of pixels is not symmetric. The pixel it was driven from belongs to the segment before.
+    The pixel that a segment was driven from belongs to the segment before.
     """
     rows, cols = counts.shape
     for fix in fixes:
@@ -313,47 +314,9 @@ def _draw_segments(
         r0, c0 = row[fix - 1] - top, col[fix - 1] - left
         if r0 == r1 and c0 == c1:
             continue
-        inside = min(r0, r1) >= 0 and max(r0, r1) < rows and min(c0, c1) >= 0 and max(c0, c1) < cols
-        if r0 < r1 or (r0 == r1 and c0 < c1):
-            _draw_line(r0, c0, r1, c1, inside, counts)
-        else:
-            _draw_line(r1, c1, r0, c0, inside, counts)
+        inside = draw_line((r0, c0, r1, c1), 0, 0, counts, _KEEP)
         if inside or (0 <= r0 < rows and 0 <= c0 < cols):
             counts[r0, c0] -= np.uint32(1)
-
-
-@njit(cache=True)
-def _draw_line(r0: int, c0: int, r1: int, c1: int, inside: bool, counts: NDArray[np.uint32]) -> None:
-    """Add one to every pixel of Bresenham's line from (r0, c0) to (r1, c1), r0 <= r1, both ends included.
-
-    The line has ``n`` steps along its major axis, of which ``m`` also step along the minor axis: whenever the
-    error, started at n / 2 and reduced by m each step, falls below zero and is raised by n again.
-    """
-    rows, cols = counts.shape
-    d_row, d_col, east = r1 - r0, abs(c1 - c0), 1 if c1 >= c0 else -1
-    steep = d_row > d_col
-    n, m = (d_row, d_col) if steep else (d_col, d_row)
-    error = n >> 1
-    if inside:
-        major, minor = (cols, east) if steep else (east, cols)
-        pixels = counts.reshape(-1)
-        pixel = r0 * cols + c0
-        for _ in range(n + 1):
-            pixels[pixel] += np.uint32(1)
-            error -= m
-            below = error >> 63  # -1 below zero, else 0: no branch to mispredict
-            error += n & below
-            pixel += major + (minor & below)
-        return
-    r, c = r0, c0
-    for _ in range(n + 1):
-        if 0 <= r < rows and 0 <= c < cols:
-            counts[r, c] += np.uint32(1)
-        error -= m
-        below = error < 0
-        error += n if below else 0
-        r += 1 if steep or below else 0
-        c += east if not steep or below else 0
 
 
 @njit(cache=True)

@@ -12,7 +12,9 @@ from probe2road.errors import OptionError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.raster.grid import Grid
 
-__all__ = ["draw_lines", "label_mask"]
+__all__ = ["draw_line", "draw_lines", "label_mask"]
+
+_KEEP_NOTHING = np.uint8(0)  # lines make ones of whatever was there
 
 
 def label_mask(graph: RoadGraph, grid: Grid, *, width: int = 1) -> NDArray[np.uint8]:
@@ -99,6 +101,76 @@ def draw_lines(
     return mask
 
 
+@njit(inline="always")
+def draw_line(
+    ends: tuple[int, int, int, int],
+    before: int,
+    after: int,
+    values: NDArray[np.unsignedinteger],
+    keep: np.unsignedinteger,
+) -> bool:
+    """Draw Bresenham's line between two pixels, both included, into an array; what lies outside is left out.
+
+    Every line is drawn from its northern (then western) end, because Bresenham's choice of pixels is not symmetric:
+    so it does not matter which way an edge runs or a trace was driven. The line has ``n`` steps along its major axis,
+    of which ``m`` also step along the minor axis: whenever the error, started at n / 2 and reduced by m each step,
+    falls below zero and is raised by n again.
+
+    The code is copied into its callers, so that what is constant there (a width of one pixel, what is kept) costs
+    nothing.
+
+    Parameters
+    ----------
+    ends
+        Row and column of one end, then of the other.
+    before, after
+        Pixels up and left, and down and right, to which each pixel of the line is widened.
+    values
+        Shape ``(rows, cols)``, contiguous, changed in place: one is added to ``values & keep`` in every pixel.
+    keep
+        Of the type of the values: all bits to count lines, 0 to draw ones.
+
+    Returns
+    -------
+    bool
+        Whether the whole line lies inside.
+    """
+    rows, cols = values.shape
+    r0, c0, r1, c1 = ends
+    if r0 > r1 or (r0 == r1 and c0 > c1):
+        r0, c0, r1, c1 = r1, c1, r0, c0
+    d_row, d_col, east = r1 - r0, abs(c1 - c0), 1 if c1 >= c0 else -1
+    steep = d_row > d_col
+    n, m = (d_row, d_col) if steep else (d_col, d_row)
+    error = n >> 1
+    inside = r0 >= before and r1 + after < rows and min(c0, c1) >= before and max(c0, c1) + after < cols
+    if inside:
+        major, minor = (cols, east) if steep else (east, cols)
+        pixels = values.reshape(-1)
+        pixel = r0 * cols + c0
+        for _ in range(n + 1):
+            for i in range(-before, after + 1):
+                for j in range(-before, after + 1):
+                    pixels[pixel + i * cols + j] = (pixels[pixel + i * cols + j] & keep) + np.uint8(1)
+            error -= m
+            below = error >> 63  # -1 below zero, else 0: no branch to mispredict
+            error += n & below
+            pixel += major + (minor & below)
+    else:
+        r, c = r0, c0
+        for _ in range(n + 1):
+            if r + after >= 0 and r - before < rows and c + after >= 0 and c - before < cols:
+                for i in range(max(r - before, 0), min(r + after + 1, rows)):
+                    for j in range(max(c - before, 0), min(c + after + 1, cols)):
+                        values[i, j] = (values[i, j] & keep) + np.uint8(1)
+            error -= m
+            slip = error < 0
+            error += n if slip else 0
+            r += 1 if steep or slip else 0
+            c += east if not steep or slip else 0
+    return inside
+
+
 @njit(cache=True)
 def _draw(
     row: NDArray[np.int64],
@@ -108,27 +180,7 @@ def _draw(
     after: int,
     mask: NDArray[np.uint8],
 ) -> None:
-    """Set the pixels of Bresenham's lines between the vertices of each owner, and ``before``/``after`` around them.
-
-    Every line is drawn from its northern (then western) end, so that it does not matter which way an edge runs.
-    """
+    """Set the pixels of the lines between the vertices of each owner, and ``before``/``after`` around them."""
     for k in range(1, len(row)):
-        if owner[k] != owner[k - 1]:
-            continue
-        a, b = k - 1, k
-        if row[a] > row[b] or (row[a] == row[b] and col[a] > col[b]):
-            a, b = b, a
-        r, c = row[a], col[a]
-        d_row, d_col = row[b] - row[a], abs(col[b] - col[a])
-        east = 1 if col[b] >= col[a] else -1
-        steps, minor = max(d_row, d_col), min(d_row, d_col)
-        error = steps // 2
-        for _ in range(steps + 1):
-            for i in range(max(r - before, 0), min(r + after + 1, mask.shape[0])):
-                for j in range(max(c - before, 0), min(c + after + 1, mask.shape[1])):
-                    mask[i, j] = 1
-            error -= minor
-            slip = error < 0
-            error += steps if slip else 0
-            r += 1 if d_row > d_col or slip else 0
-            c += east if d_row <= d_col or slip else 0
+        if owner[k] == owner[k - 1]:
+            draw_line((row[k - 1], col[k - 1], row[k], col[k]), before, after, mask, _KEEP_NOTHING)

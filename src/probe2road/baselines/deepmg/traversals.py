@@ -28,7 +28,7 @@ from probe2road.bounds import Positive
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.candidates import Scratch, nearest_points, new_scratch
 from probe2road.matching.network import Follow, States, build_follow, build_states
-from probe2road.matching.routes import Labels, new_labels, search
+from probe2road.matching.routes import Labels, RouteQuery, new_labels, search
 from probe2road.options import checked
 
 __all__ = ["MatcherOptions", "count_traversals"]
@@ -128,11 +128,10 @@ def _count(
     """Match run by run, and count the directed edges of all pieces."""
     count = np.zeros(len(model.states.head), np.int64)
     scratch, labels = new_scratch(len(model.states.x)), new_labels(len(model.states.head))
-    number = 0
     for run in range(len(starts) - 1):
         own = slice(starts[run], starts[run + 1])
         chain = _candidates(model, x[own], y[own], starts[run], scratch)
-        number = _forward(model, x[own], y[own], chain, labels, number)
+        _forward(model, x[own], y[own], chain, labels)
         chosen = _backward(chain)
         piece = [0 for _ in range(0)]
         for k in range(len(chosen)):
@@ -145,7 +144,7 @@ def _count(
             source = chain.back[chosen[k]]
             if len(piece) == 0:
                 piece.append(chain.state[source])
-            number = _append_route(model, chain, source, chosen[k], straight, labels, number, piece)
+            _append_route(model, chain, source, chosen[k], straight, labels, piece)
         _add_piece(piece, model.min_path, count)
     return count
 
@@ -177,9 +176,7 @@ def _candidates(model: _Model, x: NDArray[np.float64], y: NDArray[np.float64], q
 
 
 @njit(cache=True)
-def _forward(
-    model: _Model, x: NDArray[np.float64], y: NDArray[np.float64], chain: _Chain, labels: Labels, number: int
-) -> int:
+def _forward(model: _Model, x: NDArray[np.float64], y: NDArray[np.float64], chain: _Chain, labels: Labels) -> None:
     """Turn the densities of candidates into the scores of the best chains that end there.
 
     Candidates that no route reaches are left out from then on (score -inf), unless none is reached at all.
@@ -191,15 +188,14 @@ def _forward(
         for source in range(chain.first[k - 1], low):
             if high == low or chain.score[source] == -np.inf:
                 continue
-            number = _search(model, chain, source, low, high, straight, labels, number)
+            _search(model, chain, source, low, high, straight, labels)
             for target in range(low, high):
-                route = _route(model, chain, source, target, labels, number)[0]
+                route = _route(model, chain, source, target, labels)[0]
                 value = chain.score[source] - abs(route - straight) / model.beta
                 if value > best[target - low]:
                     best[target - low], chain.back[target] = value, source
         if (best > -np.inf).any():
             chain.score[low:high] += best
-    return number
 
 
 @njit(cache=True)
@@ -217,46 +213,41 @@ def _backward(chain: _Chain) -> NDArray[np.int64]:
 
 
 @njit(cache=True)
-def _search(
-    model: _Model, chain: _Chain, source: int, low: int, high: int, straight: float, labels: Labels, number: int
-) -> int:
+def _search(model: _Model, chain: _Chain, source: int, low: int, high: int, straight: float, labels: Labels) -> None:
     """Label the starts of the directed edges of candidates ``low`` to ``high`` by routes from a source."""
-    number += 1
-    n_wanted = 0
+    labels.number[0] += 1
+    number, n_wanted = labels.number[0], 0
     for target in range(low, high):
         n_wanted += labels.wanted[chain.state[target]] != number
         labels.wanted[chain.state[target]] = number
     origin = chain.state[source]
     rest = (model.states.length[origin >> 1] - chain.progress[source]) * model.factor[origin >> 1]
     limit = _REACH_FACTOR * straight + _REACH
-    search(model.routed, model.follow, origin, rest, 1.0, limit, labels, number, n_wanted)
-    return number
+    search(model.routed, model.follow, RouteQuery(origin, rest, 1.0, limit, n_wanted), labels)
 
 
 @njit(cache=True)
-def _route(model: _Model, chain: _Chain, source: int, target: int, labels: Labels, number: int) -> tuple[float, bool]:
+def _route(model: _Model, chain: _Chain, source: int, target: int, labels: Labels) -> tuple[float, bool]:
     """Length of the route between two candidates as it counts, infinite without one, and whether it stays."""
     d = chain.state[target]
     if chain.state[source] == d:
         step = chain.progress[target] - chain.progress[source]
         return (step * model.factor[d >> 1] if step > 0 else np.inf), True
-    if labels.stamp[d] != number:
+    if labels.stamp[d] != labels.number[0]:
         return np.inf, False
     return labels.key[d] + chain.progress[target] * model.factor[d >> 1], False
 
 
 @njit(cache=True)
 def _append_route(
-    model: _Model, chain: _Chain, source: int, target: int, straight: float, labels: Labels, number: int,
-    piece: list[int],
-) -> int:  # fmt: skip
-    """Append the directed edges of a route behind its first to a piece; return the number of the search."""
+    model: _Model, chain: _Chain, source: int, target: int, straight: float, labels: Labels, piece: list[int]
+) -> None:
+    """Append the directed edges of a route behind its first to a piece."""
     d = chain.state[target]
     if chain.state[source] == d:
-        return number
-    number = _search(model, chain, source, target, target + 1, straight, labels, number)
+        return
+    _search(model, chain, source, target, target + 1, straight, labels)
     route = [d]
     while labels.before[route[-1]] >= 0:
         route.append(labels.before[route[-1]])
     piece.extend(route[::-1])
-    return number

@@ -12,6 +12,7 @@ out the corners of the polylines that maps draw curves with.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -38,9 +39,11 @@ _FADE_PER_METRE = 15.0  # m of link over which one metre of gap is closed
 _MIN_FADE = 10.0  # m
 
 
-@dataclass(frozen=True)
-class SectionShapes:
-    """Vertices of all section lines, flat, with what is needed to walk along them."""
+class SectionShapes(NamedTuple):
+    """Vertices of all section lines, flat, with what is needed to walk along them.
+
+    A named tuple, which compiled code takes whole.
+    """
 
     xyz: NDArray[np.float64]  # (n, 3) m
     tangent: NDArray[np.float64]  # (n, 2) unit vector from u to v, the mean of both sides at a vertex
@@ -62,6 +65,25 @@ class DrivenPath:
     curvature: NDArray[np.float64]  # (n,) 1/m, positive to the right
     position: NDArray[np.int64]  # (n,) index into the route of the link being driven
     lane: NDArray[np.int64]  # (n,) lane within the link, 0 the leftmost in the driving direction
+
+
+class _Drive(NamedTuple):
+    """A route of m links; see `driven_path`."""
+
+    route: NDArray[np.int64]  # (m,)
+    entered: NDArray[np.int64]  # (m,)
+    left: NDArray[np.int64]  # (m,)
+    change: NDArray[np.float64]  # (m, 2) m
+    indptr: NDArray[np.int64]  # (m + 1,) link i has the samples indptr[i]:indptr[i + 1]
+
+
+class _Links(NamedTuple):
+    """The links of a network and the shapes of their lanes; see `LinkGraph` and `LinkLanes`."""
+
+    section: NDArray[np.int64]
+    direction: NDArray[np.int64]
+    lane_indptr: NDArray[np.int64]
+    lane_shape: NDArray[np.float64]
 
 
 def section_shapes(network: RoadNetwork) -> SectionShapes:
@@ -119,52 +141,39 @@ def driven_path(
     """
     count = np.maximum(np.ceil(shapes.lengths[graph.section[route]] / _SPACING).astype(np.int64), 1) + 1
     indptr = np.concatenate([[0], np.cumsum(count)])
-    raw, tangent, along = _sample_links(
-        route, entered, left, change, indptr, graph.section, graph.direction, lanes.indptr, lanes.shape,
-        shapes.xyz, shapes.tangent, shapes.along, shapes.indptr,
-    )  # fmt: skip
+    links = _Links(graph.section, graph.direction, lanes.indptr, lanes.shape)
+    raw, tangent, along = _sample_links(_Drive(route, entered, left, change, indptr), links, shapes)
     xyz, position = _join_links(raw, tangent, along, indptr)
     return _resampled(xyz, position, entered, left, change)
 
 
 @njit(cache=True)
 def _sample_links(
-    route: NDArray[np.int64],
-    entered: NDArray[np.int64],
-    left: NDArray[np.int64],
-    change: NDArray[np.float64],
-    indptr: NDArray[np.int64],
-    link_section: NDArray[np.int64],
-    link_direction: NDArray[np.int64],
-    lane_indptr: NDArray[np.int64],
-    lane_shape: NDArray[np.float64],
-    xyz: NDArray[np.float64],
-    vertex_tangent: NDArray[np.float64],
-    vertex_along: NDArray[np.float64],
-    vertex_indptr: NDArray[np.int64],
+    drive: _Drive, links: _Links, shapes: SectionShapes
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Sample every link at its lane: points ``(k, 3)``, unit driving directions ``(k, 2)``, metres along the link."""
+    route, entered, left, change, indptr = drive
     points = np.zeros((indptr[-1], 3))
     tangent = np.zeros((indptr[-1], 2))
     along = np.zeros(indptr[-1])
     for i in range(len(route)):
-        section, forward = link_section[route[i]], link_direction[route[i]] > 0
-        first, last = vertex_indptr[section], vertex_indptr[section + 1] - 1
-        length = vertex_along[last]
-        lane = lane_indptr[route[i]]
+        section, forward = links.section[route[i]], links.direction[route[i]] > 0
+        first, last = shapes.indptr[section], shapes.indptr[section + 1] - 1
+        length = shapes.along[last]
+        lane = links.lane_indptr[route[i]]
+        entry_lane, exit_lane = links.lane_shape[lane + entered[i]], links.lane_shape[lane + left[i]]
         vertex = first if forward else last - 1
         n = indptr[i + 1] - indptr[i]
         for k in range(n):
             s = length * k / (n - 1)  # along the drive
             at = s if forward else length - s  # along the section
-            while forward and vertex < last - 1 and vertex_along[vertex + 1] < at:
+            while forward and vertex < last - 1 and shapes.along[vertex + 1] < at:
                 vertex += 1
-            while not forward and vertex > first and vertex_along[vertex] > at:
+            while not forward and vertex > first and shapes.along[vertex] > at:
                 vertex -= 1
             row = indptr[i] + k
-            _place(xyz, vertex_tangent, vertex_along, vertex, at, forward, points[row], tangent[row])
-            old = _lane_offset(lane_shape[lane + entered[i]], s, length)
-            new = _lane_offset(lane_shape[lane + left[i]], s, length)
+            _place(shapes, vertex, at, forward, points[row], tangent[row])
+            old, new = _lane_offset(entry_lane, s, length), _lane_offset(exit_lane, s, length)
             moved = _smooth_step((s - change[i, 0]) / max(change[i, 1] - change[i, 0], 1e-6))
             offset = old + (new - old) * moved
             points[row, 0] += offset * tangent[row, 1]
@@ -175,9 +184,7 @@ def _sample_links(
 
 @njit(cache=True)
 def _place(
-    xyz: NDArray[np.float64],
-    vertex_tangent: NDArray[np.float64],
-    vertex_along: NDArray[np.float64],
+    shapes: SectionShapes,
     vertex: int,
     at: float,
     forward: bool,
@@ -185,12 +192,12 @@ def _place(
     tangent: NDArray[np.float64],
 ) -> None:
     """Write the point of a section line behind a vertex, and its unit driving direction."""
-    run = vertex_along[vertex + 1] - vertex_along[vertex]
-    share = (at - vertex_along[vertex]) / run if run > 0 else 0.0
+    run = shapes.along[vertex + 1] - shapes.along[vertex]
+    share = (at - shapes.along[vertex]) / run if run > 0 else 0.0
     for axis in range(3):
-        point[axis] = xyz[vertex, axis] * (1 - share) + xyz[vertex + 1, axis] * share
+        point[axis] = shapes.xyz[vertex, axis] * (1 - share) + shapes.xyz[vertex + 1, axis] * share
     for axis in range(2):
-        tangent[axis] = vertex_tangent[vertex, axis] * (1 - share) + vertex_tangent[vertex + 1, axis] * share
+        tangent[axis] = shapes.tangent[vertex, axis] * (1 - share) + shapes.tangent[vertex + 1, axis] * share
     size = max(np.hypot(tangent[0], tangent[1]), 1e-9) * (1.0 if forward else -1.0)
     tangent[0], tangent[1] = tangent[0] / size, tangent[1] / size
 

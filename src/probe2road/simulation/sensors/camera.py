@@ -75,9 +75,11 @@ class CameraModel:
             raise OptionError(f"near is {self.near}, far is {self.far}", where="CameraModel", fix="use near < far")
 
 
-@dataclass(frozen=True)
-class FeatureIndex:
-    """Pieces of lines in the order of the cells that they lie in; n pieces, r x c cells."""
+class FeatureIndex(NamedTuple):
+    """Pieces of lines in the order of the cells that they lie in; n pieces, r x c cells.
+
+    A named tuple, which compiled code takes whole.
+    """
 
     pieces: NDArray[np.float32]  # (n, 6) x, y, z of both ends, relative to origin
     kind: NDArray[np.int8]  # (n,) LANE_MARKING or ROAD_BOUNDARY
@@ -98,6 +100,17 @@ class Detections:
     feature: NDArray[np.int64]  # (n,) line that was seen; -1 for a false point
 
 
+class _Keyframes(NamedTuple):
+    """A drive as the camera meets it: n keyframes."""
+
+    xyz: NDArray[np.float64]  # (n, 3) m, from the origin of the index
+    heading: NDArray[np.float64]  # (n,) radians clockwise from north
+    driven: NDArray[np.float64]  # (n,) m since the keyframe before
+    working: NDArray[np.bool_]  # (n,) no dropout of the whole camera
+    followed: NDArray[np.bool_]  # (2, n) whether boundaries to the left and to the right are followed
+    vehicles: NDArray[np.float64]  # (3, n) m ahead, nearest faces of other vehicles, infinite where there is none
+
+
 class _View(NamedTuple):
     """The part of a camera model that decides what is in view, in a form that compiled code can take."""
 
@@ -112,6 +125,7 @@ class _View(NamedTuple):
     boundary_decay: float  # m
     altitude_gate: float  # m
     altitude_slope: float
+    false_rate: float  # 1/m
 
 
 def feature_index(
@@ -205,11 +219,8 @@ def see(
     outage = _alternating(driven, model.outage_every, model.outage_length, rng)
     followed = np.stack([_alternating(driven, model.boundary_lost, model.boundary_found, rng) for _ in range(2)])
     vehicles = _vehicles(driven, model, rng)
-    view = _view(model)
-    keyframe, body, kind, feature = _detect(
-        xyz - index.origin, heading, driven, ~outage, followed, vehicles, index.pieces, index.kind, index.weight,
-        index.feature, index.cells, index.columns, view, model.false_rate, rng,
-    )  # fmt: skip
+    keyframes = _Keyframes(xyz - index.origin, heading, driven, ~outage, followed, vehicles)
+    keyframe, body, kind, feature = _detect(keyframes, index, _view(model), rng)
     return Detections(keyframe, _with_noise(body, keyframe, kind, pitch, yaw, model, rng), kind, feature)
 
 
@@ -295,46 +306,32 @@ def _vehicles(driven: NDArray[np.float64], model: CameraModel, rng: np.random.Ge
 
 @njit(cache=True)
 def _detect(
-    xyz: NDArray[np.float64],
-    heading: NDArray[np.float64],
-    driven: NDArray[np.float64],
-    working: NDArray[np.bool_],
-    followed: NDArray[np.bool_],
-    vehicles: NDArray[np.float64],
-    pieces: NDArray[np.float32],
-    kind: NDArray[np.int8],
-    weight: NDArray[np.float32],
-    feature: NDArray[np.int64],
-    cells: NDArray[np.int64],
-    columns: int,
-    view: _View,
-    false_rate: float,
-    rng: np.random.Generator,
+    keyframes: _Keyframes, index: FeatureIndex, view: _View, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int8], NDArray[np.int64]]:
     """Look from every keyframe: keyframe, true place in the vehicle frame, kind and line of each point reported."""
     codes = [(0, 0, 0) for _ in range(0)]  # keyframe, kind, line; empty lists whose types the compiler can tell
     places = [(0.0, 0.0, 0.0) for _ in range(0)]
-    rows = (len(cells) - 1) // columns
-    for i in range(len(xyz)):
-        if not working[i] or driven[i] <= 0:
+    pieces, kind, driven = index.pieces, index.kind, keyframes.driven
+    for i in range(len(driven)):
+        if not keyframes.working[i] or driven[i] <= 0:
             continue
-        sin, cos = np.sin(heading[i]), np.cos(heading[i])
-        x, y, z = xyz[i]
-        c0, c1, r0, r1 = _cells_in_view(x, y, sin, cos, view, columns, rows)
+        sin, cos = np.sin(keyframes.heading[i]), np.cos(keyframes.heading[i])
+        x, y, z = keyframes.xyz[i]
+        c0, c1, r0, r1 = _cells_in_view(x, y, sin, cos, view, index)
         for row in range(r0, r1):
-            for k in range(cells[row * columns + c0], cells[row * columns + c1]):
+            for k in range(index.cells[row * index.columns + c0], index.cells[row * index.columns + c1]):
                 u = rng.random()
                 px = pieces[k, 0] + u * (pieces[k, 3] - pieces[k, 0]) - x
                 py = pieces[k, 1] + u * (pieces[k, 4] - pieces[k, 1]) - y
                 up = pieces[k, 2] + u * (pieces[k, 5] - pieces[k, 2]) - z
                 forward, right = px * sin + py * cos, px * cos - py * sin
-                if kind[k] == ROAD_BOUNDARY and not followed[0 if right < 0 else 1, i]:
+                if kind[k] == ROAD_BOUNDARY and not keyframes.followed[0 if right < 0 else 1, i]:
                     continue
-                chance = driven[i] * weight[k] * _visibility(forward, right, up, kind[k], view)
-                if rng.random() < chance and not _hidden(forward, right, vehicles[:, i]):
-                    codes.append((i, int(kind[k]), feature[k]))
+                chance = driven[i] * index.weight[k] * _visibility(forward, right, up, kind[k], view)
+                if rng.random() < chance and not _hidden(forward, right, keyframes.vehicles[:, i]):
+                    codes.append((i, int(kind[k]), index.feature[k]))
                     places.append((forward, right, up))
-        if rng.random() < false_rate * driven[i]:
+        if rng.random() < view.false_rate * driven[i]:
             forward = view.near + (view.far - view.near) * rng.random()
             right = (2.0 * rng.random() - 1.0) * view.slope * forward
             codes.append((i, LANE_MARKING if rng.random() < 0.5 else ROAD_BOUNDARY, -1))
@@ -366,9 +363,10 @@ def _visibility(forward: float, right: float, up: float, kind: int, view: _View)
 
 @njit(cache=True)
 def _cells_in_view(
-    x: float, y: float, sin: float, cos: float, view: _View, columns: int, rows: int
+    x: float, y: float, sin: float, cos: float, view: _View, index: FeatureIndex
 ) -> tuple[int, int, int, int]:
     """Columns ``c0:c1`` and rows ``r0:r1`` of the cells that may hold a piece in the field of view."""
+    columns, rows = index.columns, (len(index.cells) - 1) // index.columns
     low_x, high_x, low_y, high_y = np.inf, -np.inf, np.inf, -np.inf
     for forward in (view.near, view.far):
         for side in (-1.0, 1.0):
