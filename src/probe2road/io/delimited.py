@@ -14,14 +14,14 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
-from pyproj import CRS
 
 from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin, may_leave_out
-from probe2road.io.columns import ColumnChoice, choose_columns, standard_kinds, times_of_column
+from probe2road.io.cells import raw_table
+from probe2road.io.columns import ColumnChoice, choose_columns
 from probe2road.io.formats import FleetFormat
+from probe2road.io.guard import parsing
 from probe2road.io.sources import RawTable, SourceFile
-from probe2road.io.wkb import text_coordinates
 
 __all__ = ["read_text_table"]
 
@@ -31,6 +31,7 @@ _DELIMITERS = (",", ";", "\t", "|", " ")  # the earlier one where two are as fre
 _HEAD = 65536  # bytes looked at for the header
 _WORDS = pa.dictionary(pa.int32(), pa.string())  # few different values in many rows
 _PLAIN_INTEGER = re.compile(r"0|-?[1-9]\d{0,17}")
+_DECIMAL_COMMA = re.compile(r"(?<![\w.,])[+-]?\d+,\d+(?![\w.,])")
 _EXAMPLES_SHOWN = 3
 _COMMENTS = ("#", "//", "%")  # that lines above the table start with
 _LINES_PARSED = 20  # to find the delimiter
@@ -83,12 +84,11 @@ def read_text_table(source: SourceFile, format: FleetFormat | None = None, *, po
         names, format.columns_of(points=points), points=points, crs=format.stated_crs, where=source.path
     )
     skip = head.n_above + format.header
-    content = _parse(source, names, choice, delimiter, skip, format)
-    table, unit, crs = _our_columns(content, choice, source)
-    guessed = tuple(f"{name}={choice.columns[name]}" for name in choice.guessed)
-    named = {name: choice.columns.get(name, choice.columns.get("geometry", name)) for name in table}
-    origin = TableOrigin("points" if points else "traces", "line", skip + 1, named, choice.by_name)
-    return RawTable(table, crs, choice.degrees, origin, (*guessed, *([f"t in {unit}"] if unit else [])))
+    has_commas = delimiter != "," and any(_DECIMAL_COMMA.search(line) for line in head.lines[format.header :])
+    content = _parse(source, names, choice, delimiter, skip, format, has_commas=has_commas)
+    origin = TableOrigin("points" if points else "traces", "line", skip + 1)
+    with parsing(source.path, "a column cannot be read", fix="write the file again, or name other columns"):
+        return raw_table(content, choice, format, origin, identifiers=_identifiers, where=source.path)
 
 
 def _read_head(source: SourceFile) -> _Head:
@@ -175,7 +175,7 @@ def _column_names(head: _Head, delimiter: str, source: SourceFile, *, header: bo
 
 def _distinct_columns(names: list[str], choice: ColumnChoice, source: SourceFile) -> list[str]:
     """Return the file's names of the chosen columns, each once; refuse a name that several columns have."""
-    wanted = list(dict.fromkeys(choice.columns.values()))
+    wanted = choice.wanted
     repeated = [name for name in wanted if names.count(name) > 1]
     if repeated:
         raise InputError(f"several columns are called {', '.join(repeated)}", where=source.path, fix="rename them")
@@ -183,12 +183,21 @@ def _distinct_columns(names: list[str], choice: ColumnChoice, source: SourceFile
 
 
 def _parse(
-    source: SourceFile, names: list[str], choice: ColumnChoice, delimiter: str, skip: int, format: FleetFormat
+    source: SourceFile,
+    names: list[str],
+    choice: ColumnChoice,
+    delimiter: str,
+    skip: int,
+    format: FleetFormat,
+    *,
+    has_commas: bool,
 ) -> pa.Table:
     """Parse the chosen columns; rows that are too short or too long are left out, or reported if there are many."""
     wanted = _distinct_columns(names, choice, source)
     types: dict[str, pa.DataType] = {choice.columns["geometry"]: pa.string()} if "geometry" in choice.columns else {}
     types |= {choice.columns[name]: _WORDS for name in ("trace_id", "vehicle_id", "kind") if name in choice.columns}
+    if format.time_format is not None:  # digits stay as they are written, leading zeros included
+        types |= {name: pa.string() for name in (choice.columns.get("t"), choice.beside.get("t")) if name is not None}
     ragged: list[Any] = []
 
     def note(row: Any) -> str:
@@ -204,6 +213,7 @@ def _parse(
             read_options=pyarrow.csv.ReadOptions(use_threads=False, column_names=numbers, skip_rows=skip),
             parse_options=pyarrow.csv.ParseOptions(delimiter=delimiter, invalid_row_handler=note),
             convert_options=pyarrow.csv.ConvertOptions(
+                decimal_point="," if has_commas else ".",
                 include_columns=[number_of[name] for name in wanted],
                 null_values=_NULLS,
                 column_types={number_of[name]: kind for name, kind in types.items()},
@@ -223,22 +233,6 @@ def _parse(
     if binary:
         raise InputError(f"column {', '.join(binary)} is not UTF-8", where=source.path, fix="save it as UTF-8")
     return content
-
-
-def _our_columns(content: pa.Table, choice: ColumnChoice, source: SourceFile) -> tuple[pd.DataFrame, str, CRS | None]:
-    """Rename the columns to ours, unpack points and read numeric times; the unit of those, and the points' CRS."""
-    table: dict[str, Any] = {}
-    unit, crs = "", None
-    for name, theirs in choice.columns.items():
-        if name == "geometry":
-            points, crs = text_coordinates(content.column(theirs), name=theirs, where=source.path)
-            table |= points
-            continue
-        values = _identifiers(content.column(theirs)) if name.endswith("_id") else content.column(theirs).to_pandas()
-        if name == "t":
-            values, unit = times_of_column(values, theirs, where=source.path)
-        table[name] = standard_kinds(values) if name == "kind" else values
-    return pd.DataFrame(table, copy=False), unit, crs
 
 
 def _identifiers(column: pa.ChunkedArray) -> pd.Series:

@@ -20,6 +20,7 @@ from probe2road.fleet.contract import Fleet, fleet_from_checked
 from probe2road.fleet.tables import TableOrigin, check_points, check_traces
 from probe2road.fleet.trimming import trim_ends
 from probe2road.io.atomic import settled
+from probe2road.io.clocks import FIRST_YEAR, LAST_YEAR
 from probe2road.io.delimited import read_text_table
 from probe2road.io.fleet_writer import points_path
 from probe2road.io.formats import BBox, ColumnMap, FleetFormat, adjusted
@@ -47,7 +48,6 @@ _DAMAGE = (
 )
 _ROW_NUMBERS = ("id",)  # columns that number traces in some files, and rows in others
 _FEW_ROWS = 3  # of so few, ids that all differ say nothing
-_FIRST_YEAR, _LAST_YEAR = 1985, 2100  # that drives with a satellite receiver may be from
 _FILES_SHOWN = 10  # files with faults named in one error
 
 
@@ -63,6 +63,9 @@ def read_fleet(
     bbox: BBox | None = None,
     delimiter: str | None = None,
     header: bool | None = None,
+    time_format: str | None = None,
+    interval: float | None = None,
+    layer: str | None = None,
     invalid: str | None = None,
     max_accuracy: float | None = None,
     max_speed: float | None = None,
@@ -102,6 +105,13 @@ def read_fleet(
         Of text tables; told from the first line where it is not given.
     header
         Whether text tables start with a line of names, as they do by default; without, the columns are called 0, 1, 2.
+    time_format
+        How times are written, for `datetime.datetime.strptime`, such as ``"%d.%m.%Y %H:%M:%S"``. Not needed for ISO
+        8601, for numbers, and where only one usual way of writing times fits.
+    interval
+        Seconds between the positions of a line that has only the time of its start.
+    layer
+        Of the fixes, in a GIS file with several layers of points.
     invalid
         What happens to rows without position, id or readable time, to lines of text with another number of fields, and
         to fixes that repeat a time at another place: ``"drop"`` leaves them out with a warning, ``"refuse"`` refuses
@@ -146,6 +156,9 @@ def read_fleet(
         bbox=bbox,
         delimiter=delimiter,
         header=header,
+        time_format=time_format,
+        interval=interval,
+        layer=layer,
         invalid=invalid,
         max_accuracy=max_accuracy,
         max_speed=max_speed,
@@ -182,7 +195,7 @@ def read_fleet(
 def _warn_of_times(times: pd.Series) -> None:
     """Warn of a fleet at a time before satellites, or that nobody has lived to see."""
     middle = times.dropna().median() if times.notna().any() else None
-    if middle is not None and not _FIRST_YEAR <= middle.year <= _LAST_YEAR:
+    if middle is not None and not FIRST_YEAR <= middle.year <= LAST_YEAR:
         logger.warning(
             "half of the times are before %s: in the year %d are no such drives; numbers count as seconds since 1970 "
             "if nothing else is told by their size, check the column of times",
