@@ -7,7 +7,7 @@ by `probe2road.io.clocks`, the rest by the units of `probe2road.io.units`. Whate
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ from probe2road.io.columns import ColumnChoice, standard_kinds
 from probe2road.io.formats import FleetFormat
 from probe2road.io.sources import RawTable
 from probe2road.io.units import UNITS, in_our_unit, normal
-from probe2road.io.wkb import point_coordinates, text_coordinates
+from probe2road.io.wkb import Places, point_coordinates, text_coordinates
 
 __all__ = ["raw_table"]
 
@@ -80,13 +80,15 @@ def raw_table(
     """
     table: dict[str, Any] = {}
     lines: _Lines | None = None
+    degrees = choice.degrees
     if "geometry" in choice.columns:
         theirs = choice.columns["geometry"]
         timed = "t" in choice.columns or not format.columns.get("t", True)  # or the user does without
         has_lines = origin.name == "traces" and timed
-        places, found_crs, lines = _places(content.column(theirs), theirs, lines=has_lines, where=where)
-        table |= places
-        crs = crs or found_crs
+        places, lines = _places(content.column(theirs), theirs, lines=has_lines, where=where)
+        table |= places.axes
+        crs = crs or places.crs
+        degrees = places.in_json and _in_range(places.axes)
     told: list[str] = []
     for name, theirs in choice.columns.items():
         if name == "geometry":
@@ -113,21 +115,24 @@ def raw_table(
     names = {name: choice.columns.get(name, choice.columns.get("geometry", name)) for name in table}
     row_word, first_row = (origin.row_word, origin.first_row) if lines is None else ("position", 0)
     origin = TableOrigin(origin.name, row_word, first_row, names, choice.by_name)
-    return RawTable(pd.DataFrame(table, copy=False), crs, choice.degrees, origin, guessed, skipped)
+    return RawTable(pd.DataFrame(table, copy=False), crs, degrees, origin, guessed, skipped)
 
 
-def _places(
-    column: pa.ChunkedArray, name: str, *, lines: bool, where: object
-) -> tuple[dict[str, NDArray[np.float64]], CRS | None, _Lines | None]:
+def _places(column: pa.ChunkedArray, name: str, *, lines: bool, where: object) -> tuple[Places, _Lines | None]:
     """Unpack a column of points, or of lines in text."""
     if not (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)):
-        return point_coordinates(column, name=name, where=where), None, None
+        return Places(point_coordinates(column, name=name, where=where), None, None), None
     places = text_coordinates(column, name=name, lines=lines, where=where)
     if places.rows is None:
-        return places.axes, places.crs, None
+        return places, None
     counts = np.bincount(places.rows, minlength=len(column))
     number = np.arange(len(places.rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return places.axes, places.crs, _Lines(places.rows, number, counts)
+    return places, _Lines(places.rows, number, counts)
+
+
+def _in_range(axes: Mapping[str, NDArray[np.float64]]) -> bool:
+    """Say whether all positions could be longitudes and latitudes."""
+    return all(bool(np.nanmax(np.abs(axes[axis]), initial=0.0) <= limit) for axis, limit in (("x", 180.0), ("y", 90.0)))
 
 
 def _plain_series(column: pa.ChunkedArray, *, is_id: bool = False) -> pd.Series:

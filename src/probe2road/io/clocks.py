@@ -196,10 +196,11 @@ def _joined(values: pd.Series, dates: pd.Series | None, *, has_format: bool) -> 
     if dates is None:
         return words
     clock = words.str.replace(r"\.0+$", "", regex=True).str.replace(r"^(\d{1,5})(?=\.|$)", _six_digits, regex=True)
+    days = _words(dates).str.replace(r"^(\d{5}|\d{7})$", r"0\1", regex=True)  # 010524 that was read as a number
     if has_format:
         return _words(dates) + " " + words
     if clock.dropna().str.fullmatch(_TIME_OF_DAY).all() or clock.dropna().str.fullmatch(_DIGITS_OF_DAY).all():
-        return _words(dates).str.replace(_MIDNIGHT, "", regex=True) + " " + clock
+        return days.str.replace(_MIDNIGHT, "", regex=True) + " " + clock
     return values
 
 

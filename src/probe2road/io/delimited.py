@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import gzip
 import json
 import logging
 import re
@@ -21,7 +20,7 @@ from probe2road.io.cells import raw_table
 from probe2road.io.columns import ColumnChoice, choose_columns
 from probe2road.io.formats import FleetFormat
 from probe2road.io.guard import parsing
-from probe2road.io.sources import RawTable, SourceFile
+from probe2road.io.sources import RawTable, SourceFile, opened
 
 __all__ = ["read_text_table"]
 
@@ -94,7 +93,7 @@ def read_text_table(source: SourceFile, format: FleetFormat | None = None, *, po
 def _read_head(source: SourceFile) -> _Head:
     """Read the top of a text file."""
     try:
-        with gzip.open(source.path) if source.path.suffix.lower() == ".gz" else source.path.open("rb") as file:
+        with opened(source) as file:
             head = file.read(_HEAD)
     except (OSError, EOFError, zlib.error) as error:
         raise _broken(source, error) from error

@@ -25,7 +25,10 @@ from probe2road.io.delimited import read_text_table
 from probe2road.io.fleet_writer import points_path
 from probe2road.io.formats import BBox, ColumnMap, FleetFormat, adjusted
 from probe2road.io.gpx import read_gpx
+from probe2road.io.layers import read_layer
+from probe2road.io.nmea import read_nmea
 from probe2road.io.parquet import inside, read_parquet
+from probe2road.io.plt import read_plt
 from probe2road.io.sources import RawTable, SourceFile, find_sources
 
 __all__ = ["read_fleet", "read_fleet_files"]
@@ -46,6 +49,9 @@ _DAMAGE = (
     OSError,
     pa.ArrowException,
 )
+# Format of `probe2road.io.sources.FORMATS` to its reader.
+_TABLES = {"parquet": read_parquet, "text": read_text_table, "layer": read_layer}
+_RECORDINGS = {"gpx": read_gpx, "nmea": read_nmea, "plt": read_plt}  # of one layout, and of traces only
 _ROW_NUMBERS = ("id",)  # columns that number traces in some files, and rows in others
 _FEW_ROWS = 3  # of so few, ids that all differ say nothing
 _FILES_SHOWN = 10  # files with faults named in one error
@@ -73,8 +79,10 @@ def read_fleet(
     r"""Read traces, and semantic points where there are any, and check everything.
 
     Formats go by suffix: Parquet and GeoParquet (``.parquet``, ``.pq``, ``.geoparquet``), text tables
-    (``.csv``, ``.tsv``, ``.txt``, each also with ``.gz``) and GPX (``.gpx``, ``.gpx.gz``). A folder stands for
-    all of them in it and below; files called ``points`` or ``NAME.points`` are left out of the traces.
+    (``.csv``, ``.tsv``, ``.txt``, ``.log``), GPX (``.gpx``), logs of NMEA sentences (``.nmea``, or text that begins
+    with ``$G``), GeoLife's and OziExplorer's ``.plt``, all text also with ``.gz``, and layers of points in GIS files
+    (``.gpkg``, ``.geojson``, ``.json``, ``.fgb``, ``.shp``). A folder stands for all of them in it and below; files
+    called ``points`` or ``NAME.points`` are left out of the traces, and GIS files where anything else is there.
 
     Traces are told apart by their ids across all files. A file without ids is one trace called like the
     file, and in GPX every track segment is a trace called ``file/track/segment``.
@@ -85,7 +93,8 @@ def read_fleet(
         A file, a folder, or a sequence of them. Trace columns are those of `Fleet`; times are ISO 8601 text,
         timestamps, or numbers since 1970 in s, ms, us or ns (told by their size); without zone they are UTC.
     points
-        Semantic points, likewise (not GPX). Kinds may have the names in `probe2road.io.columns.KIND_SYNONYMS`.
+        Semantic points, likewise (tables and layers only). Kinds may have the names in
+        `probe2road.io.columns.KIND_SYNONYMS`.
     format
         The parameters below in one object, for example out of a TOML file; a parameter that is given, too, takes the
         place of its field. None leaves what the format says, and what a `FleetFormat` says by default.
@@ -260,14 +269,13 @@ def _read_all(source: Source, format: FleetFormat, *, points: bool) -> tuple[pd.
 
 
 def _read_one(file: SourceFile, format: FleetFormat, *, points: bool) -> RawTable:
-    """Read one file by the reader of its suffix."""
-    if file.format == "parquet":
-        return read_parquet(file, format, points=points)
-    if file.format == "text":
-        return read_text_table(file, format, points=points)
+    """Read one file by the reader of its format."""
+    if file.format in _TABLES:
+        return _TABLES[file.format](file, format, points=points)
     if points:
-        raise InputError("GPX holds no semantic points", where=file.path, fix="use a text table or Parquet")
-    return read_gpx(file)
+        what = f"{file.format.upper()} holds no semantic points"
+        raise InputError(what, where=file.path, fix="use a text table, Parquet or a layer")
+    return _RECORDINGS[file.format](file, invalid=format.invalid)
 
 
 def _crs_of(raw: RawTable, file: SourceFile, given: CRS | None) -> CRS:

@@ -6,7 +6,7 @@ collected in lists and converted together at the end. Routes and waypoints are n
 
 from __future__ import annotations
 
-import gzip
+import logging
 import zlib
 from typing import Any
 from xml.parsers import expat
@@ -17,14 +17,18 @@ import pandas as pd
 from probe2road.crs import WGS84
 from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin
-from probe2road.io.sources import RawTable, SourceFile
+from probe2road.io.sources import RawTable, SourceFile, opened
 
 __all__ = ["read_gpx"]
+
+logger = logging.getLogger(__name__)
+
+_ANONYMOUS = "openstreetmap.org"  # creator of files with the points of many, whose own files it names otherwise
 
 _VALUES = {"ele": "z", "time": "t", "speed": "speed", "course": "heading"}  # children of a track point, at any depth
 
 
-def read_gpx(source: SourceFile) -> RawTable:
+def read_gpx(source: SourceFile, *, invalid: str | None = None) -> RawTable:
     """Read the track points of one GPX file.
 
     Every track segment is a trace, called ``name of the file/number of the track/number of the segment``,
@@ -34,6 +38,8 @@ def read_gpx(source: SourceFile) -> RawTable:
     ----------
     source
         File with suffix ``.gpx`` or ``.gpx.gz``.
+    invalid
+        ``"refuse"`` also refuses a file in which only some points are anonymous.
 
     Returns
     -------
@@ -43,7 +49,8 @@ def read_gpx(source: SourceFile) -> RawTable:
     Raises
     ------
     InputError
-        If the XML is broken (with the line), the file is no GPX, or it has no track points.
+        If the XML is broken (with the line), the file is no GPX, it has no track points, or only anonymous ones of the
+        OpenStreetMap server, which are no drive.
     """
     lists = _parse(source)
     if not lists["lon"]:
@@ -58,17 +65,37 @@ def read_gpx(source: SourceFile) -> RawTable:
         if values.count(None) < len(values):
             table[name] = pd.Series(values, dtype=object) if tag == "time" else _numbers(values)
     columns = {"x": "lon", "y": "lat", "z": "ele", "t": "time", "heading": "course"}
-    return RawTable(pd.DataFrame(table), WGS84, True, TableOrigin("traces", "track point", 0, columns))
+    return RawTable(
+        _drives(pd.DataFrame(table), lists, source, invalid),
+        WGS84,
+        True,
+        TableOrigin("traces", "track point", 0, columns),
+    )
+
+
+def _drives(table: pd.DataFrame, lists: dict[str, list[Any]], source: SourceFile, invalid: str | None) -> pd.DataFrame:
+    """Leave out what is no drive: points without time that the OpenStreetMap server gives in no order."""
+    untimed = table["t"].isna() if "t" in table else pd.Series(True, table.index)
+    untimed = untimed.groupby(table["trace_id"], sort=False).transform("all")
+    if not untimed.any() or not any(_ANONYMOUS in creator.lower() for creator in lists["creator"]):
+        return table
+    what = f"{int(untimed.sum())} of {len(table)} track points of the OpenStreetMap server are anonymous"
+    if untimed.all() or invalid == "refuse":
+        fault = f"{what}: without times and order they are no drive"
+        fix = "download traces that are identifiable or trackable, each as its own file"
+        raise InputError(fault, where=source.path, fix=fix)
+    logger.warning("%s: %s, no drive: left out", source.path, what)
+    return table[~untimed].reset_index(drop=True)
 
 
 def _parse(source: SourceFile) -> dict[str, list[Any]]:
     """Return the texts of all track points, and the numbers and first points of their segments."""
-    lists: dict[str, list[Any]] = {name: [] for name in ("lon", "lat", *_VALUES, "segment", "start")}
+    lists: dict[str, list[Any]] = {name: [] for name in ("lon", "lat", *_VALUES, "segment", "start", "creator")}
     parser = expat.ParserCreate()
     parser.buffer_text = True
     _connect(parser, lists, source)
     try:
-        with gzip.open(source.path) if source.path.suffix.lower() == ".gz" else source.path.open("rb") as file:
+        with opened(source) as file:
             parser.ParseFile(file)
     except expat.ExpatError as error:
         fault = f"broken XML at line {error.lineno}, column {error.offset + 1}: {expat.ErrorString(error.code)}"
@@ -105,6 +132,8 @@ def _connect(parser: expat.XMLParserType, lists: dict[str, list[Any]], source: S
             state["segment"] = -1
         elif not state["root"] and tag != "gpx":
             raise InputError(f"the root element is <{name}>, not <gpx>", where=source.path, fix="check its suffix")
+        if not state["root"]:
+            lists["creator"].append(attributes.get("creator", ""))
         state["root"] = True
 
     def end(name: str) -> None:

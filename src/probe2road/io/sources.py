@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import pandas as pd
@@ -16,13 +19,19 @@ from probe2road.errors import InputError, MissingFileError
 from probe2road.fleet.tables import TableOrigin
 from probe2road.io.atomic import settled
 
-__all__ = ["FORMATS", "POINTS_MARK", "RawTable", "SourceFile", "find_sources"]
+__all__ = ["FORMATS", "POINTS_MARK", "RawTable", "SourceFile", "find_sources", "opened"]
 
 FORMATS = {
     **dict.fromkeys((".parquet", ".pq", ".geoparquet"), "parquet"),
-    **dict.fromkeys((".csv", ".tsv", ".txt", ".csv.gz", ".tsv.gz", ".txt.gz"), "text"),
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".log", ".csv.gz", ".tsv.gz", ".txt.gz", ".log.gz"), "text"),
     **dict.fromkeys((".gpx", ".gpx.gz"), "gpx"),
+    **dict.fromkeys((".nmea", ".nmea.gz"), "nmea"),
+    **dict.fromkeys((".plt", ".plt.gz"), "plt"),
+    **dict.fromkeys((".gpkg", ".geojson", ".json", ".fgb", ".shp"), "layer"),
 }
+# What text of a more general suffix is, by how it begins.
+_BEGINNINGS = {b"$G": "nmea", b"Geolife trajectory": "plt", b"OziExplorer Track": "plt"}
+_ASKED_FOR = ("layer",)  # formats of maps as well: taken out of a folder only where nothing else is in it
 POINTS_MARK = "points"  # a file called points.SUFFIX or NAME.points.SUFFIX holds semantic points
 
 
@@ -54,7 +63,7 @@ def find_sources(
 
     A folder stands for all files in it, and in the folders below, that have a supported suffix and are not
     hidden (a name that starts with ``.`` or ``_``). Files of semantic points beside the traces, by name, are
-    left out of a folder of traces.
+    left out of a folder of traces, and so are GIS files, which may be maps, where anything else is in it.
 
     Parameters
     ----------
@@ -99,7 +108,27 @@ def find_sources(
             files.setdefault(_existing(settled(item)), _stem(Path(item.name)))
     if len(set(files.values())) < len(files):  # files of one name: call them by their whole paths
         files = {path: path.as_posix() for path in files}
-    return [SourceFile(path, FORMATS[_suffix(path)], name) for path, name in files.items()], left_out
+    return [SourceFile(path, _format(path), name) for path, name in files.items()], left_out
+
+
+def opened(source: SourceFile) -> IO[bytes]:
+    """Open a file to read its bytes, unpacked where its suffix is .gz."""
+    if source.path.suffix.lower() == ".gz":
+        return gzip.open(source.path)
+    return source.path.open("rb")
+
+
+def _format(path: Path) -> str:
+    """Return the format of a file, by its suffix and, of text, by its first bytes."""
+    format = FORMATS[_suffix(path)]
+    if format != "text":
+        return format
+    try:
+        with opened(SourceFile(path, format, "")) as file:
+            head = file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()
+    except (OSError, EOFError, zlib.error):
+        return format  # whose reader says what is wrong
+    return next((found for beginning, found in _BEGINNINGS.items() if head.startswith(beginning)), format)
 
 
 def _existing(path: Path) -> Path:
@@ -120,7 +149,9 @@ def _supported_files(folder: Path) -> list[Path]:
         settled(place / "any")  # ends what a killed process began
     inside = (path for path in folder.rglob("*") if path.is_file() and _suffix(path) in FORMATS)
     seen = (path for path in inside if not any(part.startswith(hidden) for part in path.relative_to(folder).parts))
-    return [_existing(path) for path in sorted(seen)]
+    found = sorted(seen)
+    drives = [path for path in found if FORMATS[_suffix(path)] not in _ASKED_FOR]
+    return [_existing(path) for path in drives or found]
 
 
 def _is_marked(path: Path) -> bool:

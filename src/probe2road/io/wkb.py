@@ -36,6 +36,7 @@ class Places(NamedTuple):
     axes: dict[str, NDArray[np.float64]]  # x, y, and z where any position has a height
     crs: CRS | None  # that the text names
     rows: NDArray[np.int64] | None  # of the column, of which every position is; None: each row has one
+    in_json: bool = False  # which has longitude and latitude by convention
 
 
 def point_coordinates(column: pa.ChunkedArray, *, name: str, where: object = None) -> dict[str, NDArray[np.float64]]:
@@ -143,13 +144,13 @@ def text_coordinates(column: pa.ChunkedArray, *, name: str, lines: bool = False,
         positions, rows = shapely.get_coordinates(
             shapes, include_z=bool(shapely.has_z(shapes).any()), return_index=True
         )
-        return Places(dict(zip("xyz", positions.T, strict=False)), crs, rows)
+        return Places(dict(zip("xyz", positions.T, strict=False)), crs, rows, first[:1] == "{")
     if not np.isin(kinds, (_POINT, -1)).all():
         raise _not_points(name, where)
     axes = {"x": shapely.get_x(shapes), "y": shapely.get_y(shapes)}
     if shapely.has_z(shapes).any():
         axes["z"] = shapely.get_z(shapes)
-    return Places(axes, crs, None)
+    return Places(axes, crs, None, first[:1] == "{")
 
 
 def _positions_in_json(words: list[str | None], name: str, where: object, *, lines: bool) -> Places:
@@ -179,11 +180,11 @@ def _positions_in_json(words: list[str | None], name: str, where: object, *, lin
     if is_line or not counts.all():
         rows = np.repeat(np.arange(len(words)), counts)
         if is_line:
-            return Places(dict(zip("xyz", flat.T, strict=False)), None, rows)
+            return Places(dict(zip("xyz", flat.T, strict=False)), None, rows, in_json=True)
         whole = np.full((len(words), width), np.nan)
         whole[rows] = flat
         flat = whole
-    return Places(dict(zip("xyz", flat.T, strict=False)), None, None)
+    return Places(dict(zip("xyz", flat.T, strict=False)), None, None, in_json=True)
 
 
 def _coordinates(chunk: Any, name: str, where: object) -> dict[str, NDArray[np.float64]]:
