@@ -25,7 +25,10 @@ FLEET = {
     "--no-header",
     "--invalid",
     "--max-accuracy",
-} | {"--max-speed"}
+    "--max-speed",
+    "--time-format",
+    "--interval",
+}
 GRAPH = {"--layer", "--graph-crs"}
 REFERENCE = {"--reference-layer", "--reference-crs"}
 
@@ -33,17 +36,17 @@ REFERENCE = {"--reference-layer", "--reference-crs"}
 @pytest.mark.parametrize(
     ("verb", "offered"),
     [
-        ("build", FLEET | {"--point-columns"}),
-        ("align", FLEET | {"--point-columns"}),
-        ("match", FLEET | GRAPH),
+        ("build", FLEET | {"--point-columns", "--layer"}),
+        ("align", FLEET | {"--point-columns", "--layer"}),
+        ("match", FLEET | GRAPH | {"--traces-layer"}),
         ("evaluate", GRAPH | REFERENCE),
         ("info", FLEET | {"--layer"}),
-        ("view", FLEET | GRAPH | REFERENCE | {"--point-columns"}),
+        ("view", FLEET | GRAPH | REFERENCE | {"--point-columns", "--traces-layer"}),
     ],
 )
 def test_every_verb_offers_what_it_reads(verb: str, offered: set[str]) -> None:
     flags = {flag for option in COMMANDS[verb].params for flag in option.opts}
-    assert flags & (FLEET | GRAPH | REFERENCE | {"--point-columns"}) == offered
+    assert flags & (FLEET | GRAPH | REFERENCE | {"--point-columns", "--traces-layer"}) == offered
     assert all(option.help for option in COMMANDS[verb].params)
 
 

@@ -70,7 +70,7 @@ def _common(
 
 
 @app.command()
-@takes(fleet_format=fleet_options)
+@takes(fleet_format=fleet_options, without=["traces_layer"])
 def build(
     traces: Annotated[list[Path], typer.Argument(help="Files or folders: Parquet, GeoParquet, CSV, GPX.")],
     output: Annotated[
@@ -133,7 +133,7 @@ def build(
 
 
 @app.command()
-@takes(fleet_format=fleet_options)
+@takes(fleet_format=fleet_options, without=["traces_layer"])
 def align(
     traces: Annotated[list[Path], typer.Argument(help="Raw fleet data: files or folders.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file for the aligned traces.")],
@@ -181,7 +181,7 @@ def align(
 
 
 @app.command()
-@takes(fleet_format=fleet_options, graph_format=graph_options, without=["point_columns"])
+@takes(fleet_format=fleet_options, graph_format=graph_options, without=["point_columns", "layer"])
 def match(
     traces: Annotated[Path, typer.Argument(help="Fleet data: a file or a folder.")],
     graph: Annotated[Path, typer.Argument(help="Road graph, in any format that build writes, or OSM.")],
@@ -270,7 +270,11 @@ def evaluate(
 
 
 @app.command()
-@takes(fleet_format=fleet_options, graph_format=graph_options, without=["point_columns", "graph_crs"])
+@takes(
+    fleet_format=fleet_options,
+    graph_format=graph_options,
+    without=["point_columns", "graph_crs", "graph_layer", "traces_layer"],
+)
 def info(
     file: Annotated[Path, typer.Argument(help="Fleet data or a road graph.")],
     fleet_format: Said[FleetFormat],
@@ -279,13 +283,15 @@ def info(
     """Describe fleet data or a road graph in figures."""
     from probe2road.io.describe import describe_file
 
-    format = chosen_format(fleet_format)  # there is one file: its CRS is said in one way, whatever it holds
-    roads_format = replace(chosen_format(graph_format), crs=format.crs, target_crs=format.target_crs)
+    format = chosen_format(fleet_format)  # there is one file: its CRS and layer are said in one way, whatever it holds
+    roads_format = replace(
+        chosen_format(graph_format), crs=format.crs, target_crs=format.target_crs, layer=format.layer
+    )
     typer.echo(json.dumps(describe_file(file, format=format, graph_format=roads_format), indent=1))
 
 
 @app.command()
-@takes(fleet_format=fleet_options, graph_format=graph_options, reference_format=reference_options)
+@takes(fleet_format=fleet_options, graph_format=graph_options, reference_format=reference_options, without=["layer"])
 def view(
     graph: Annotated[Path, typer.Argument(help="Road graph.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="HTML file, or PNG.")],

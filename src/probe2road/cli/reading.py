@@ -50,6 +50,8 @@ FLAGS: Mapping[str, str] = {
     "bbox": "--bbox",
     "delimiter": "--delimiter",
     "header": "--no-header",
+    "time_format": "--time-format",
+    "interval": "--interval",
     "invalid": "--invalid",
     "max_accuracy": "--max-accuracy",
     "max_speed": "--max-speed",
@@ -111,6 +113,20 @@ def fleet_options(
             "--no-header", help="Text tables have no line of names: columns are 0, 1, 2.", rich_help_panel=_FLEET
         ),
     ] = False,
+    time_format: Annotated[
+        str | None,
+        typer.Option(help="How times are written, as for strptime: '%d.%m.%Y %H:%M:%S'.", rich_help_panel=_FLEET),
+    ] = None,
+    interval: Annotated[
+        float | None,
+        typer.Option(help="Seconds between the positions of a line that has a start time.", rich_help_panel=_FLEET),
+    ] = None,
+    layer: Annotated[
+        str | None, typer.Option(help="Layer of the fixes, in a file of several.", rich_help_panel=_FLEET)
+    ] = None,
+    traces_layer: Annotated[
+        str | None, typer.Option(help="Layer of the fixes, in a file of several.", rich_help_panel=_FLEET)
+    ] = None,
     trim_ends: Annotated[
         float | None, typer.Option(help="Metres to leave out at both ends of every trace.", rich_help_panel=_FLEET)
     ] = None,
@@ -130,7 +146,7 @@ def fleet_options(
         typer.Option(help="Leave out fixes faster than this from their neighbours, m/s.", rich_help_panel=_FLEET),
     ] = None,
 ) -> Said[FleetFormat]:
-    """Return what is said of the files of a fleet."""
+    """Return what is said of the files of a fleet; verbs that take a graph, too, call the layer ``--traces-layer``."""
     from probe2road.io.formats import FleetFormat
 
     fields = {
@@ -141,6 +157,9 @@ def fleet_options(
         "bbox": four_numbers(bbox, "--bbox") if bbox else None,
         "delimiter": delimiter,
         "header": False if no_header else None,
+        "time_format": time_format,
+        "interval": interval,
+        "layer": layer or traces_layer,
         "trim_ends": trim_ends,
         "invalid": invalid,
         "max_accuracy": max_accuracy,
@@ -150,8 +169,8 @@ def fleet_options(
 
 
 def graph_options(
-    layer: Annotated[
-        str | None, typer.Option(help="Layer of the roads, in a file of several.", rich_help_panel=_GRAPH)
+    graph_layer: Annotated[
+        str | None, typer.Option("--layer", help="Layer of the roads, in a file of several.", rich_help_panel=_GRAPH)
     ] = None,
     graph_crs: Annotated[
         str | None,
@@ -170,7 +189,7 @@ def graph_options(
     from probe2road.io.formats import GraphFormat
 
     flags = {"layer": "--layer", "crs": "--graph-crs", "inner_junctions": "--no-inner-junctions"}
-    fields = {"layer": layer, "crs": graph_crs, "inner_junctions": False if no_inner_junctions else None}
+    fields = {"layer": graph_layer, "crs": graph_crs, "inner_junctions": False if no_inner_junctions else None}
     return Said(GraphFormat, "graph_format", fields, flags)
 
 
@@ -222,8 +241,8 @@ def takes(
     ... def show(path: str, graph: Said) -> None:
     ...     print(path, graph.fields["layer"])
     >>> list(signature(show).parameters)
-    ['path', 'layer', 'no_inner_junctions']
-    >>> show(path="roads.gpkg", layer="streets")
+    ['path', 'graph_layer', 'no_inner_junctions']
+    >>> show(path="roads.gpkg", graph_layer="streets")
     roads.gpkg streets
     """
 

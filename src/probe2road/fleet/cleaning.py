@@ -24,6 +24,11 @@ BY_VEHICLE = "by_vehicle"  # column of the fixes whose trace is all that a vehic
 _PAUSE = 300.0  # s; a vehicle whose next fix is later has begun another drive
 _MOVING = 3.0  # m; shorter steps have no direction
 _FEW_STEPS = 5  # moving steps, below which headings are not judged
+_MANY_STEPS = 20  # moving steps, below which the unit of speeds is not judged
+_LONGEST_STEP = 10.0  # s; in longer ones a vehicle turns and stops, so that its speed tells nothing of the step
+_LIKE = 0.06  # share by which speeds may differ from those in a unit; knots and miles per hour are 0.14 apart
+_SPREAD = 0.3  # share by which half of the ratios of speed to movement may differ from the median
+_OTHER_UNITS = {"km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}  # m/s
 _CONTRADICTION = 60.0  # degrees between heading and movement, in the median of a trace
 
 
@@ -79,7 +84,7 @@ def accurate_fixes(table: pd.DataFrame, max_accuracy: float, *, where: object = 
 
 
 def tidied(fleet: Fleet, *, max_speed: float | None = None) -> Fleet:
-    """Return a fleet without jumps and false headings, cut where traces left the box or vehicles paused.
+    """Return a fleet without jumps, false headings and speeds, cut where traces left the box or vehicles paused.
 
     Parameters
     ----------
@@ -101,6 +106,8 @@ def tidied(fleet: Fleet, *, max_speed: float | None = None) -> Fleet:
         traces = _without_jumps(traces, max_speed)
     if "heading" in traces:
         traces = _with_true_headings(traces)
+    if "speed" in traces:
+        traces = _with_true_speeds(traces)
     if traces is fleet.traces and points is fleet.points:
         return fleet
     return type(fleet)(traces, points, fleet.crs)
@@ -196,3 +203,27 @@ def _with_true_headings(traces: pd.DataFrame) -> pd.DataFrame:
         *(len(false), len(judged), shown),
     )
     return traces.assign(heading=np.where(traces["trace_id"].isin(false), np.nan, heading))
+
+
+def _with_true_speeds(traces: pd.DataFrame) -> pd.DataFrame:
+    """Convert speeds that are those of the movement in another unit; the name of their column did not say it."""
+    east, north, same = _steps(traces)
+    step = np.hypot(east, north)
+    seconds = traces["t"].diff().dt.total_seconds().to_numpy()
+    speed: Any = traces["speed"].to_numpy()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        usable = same & (step > _MOVING) & (seconds > 0) & (seconds <= _LONGEST_STEP) & (speed > 0)
+        ratio = (speed * seconds / step)[usable]
+    if len(ratio) < _MANY_STEPS:
+        return traces
+    low, middle, high = np.quantile(ratio, [0.25, 0.5, 0.75])
+    if high - low > 2 * _SPREAD * middle:
+        return traces
+    for unit, factor in _OTHER_UNITS.items():
+        if abs(middle * factor - 1) <= _LIKE:
+            logger.warning(
+                "speeds are %.2f times those of the movement: taken as %s; say the unit in the name of the column",
+                *(middle, unit),
+            )
+            return traces.assign(speed=speed * factor)
+    return traces

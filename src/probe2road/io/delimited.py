@@ -35,6 +35,7 @@ _EXAMPLES_SHOWN = 3
 _COMMENTS = ("#", "//", "%")  # that lines above the table start with
 _LINES_PARSED = 20  # to find the delimiter
 _DATE = re.compile(r"\d{4}[-/.]?\d{2}[-/.]?\d{2}([T ]|$)|\d{1,2}[/.]\d{1,2}[/.]\d{4}")
+_EPOCH = re.compile(r"1\d{9}(?:\d{3})?(?:\.\d+)?")  # s or ms since 1970, of this century
 _NO_ID = (None, "", "NULL", "\\N")
 _NULLS = [*("", "NULL", "null", "Null", "NaN", "nan", "NA", "N/A", "n/a", "#N/A", "None", "\\N", "-", "NaT")]
 
@@ -140,6 +141,7 @@ def _refuse_data_as_names(names: list[str], head: _Head, source: SourceFile, *, 
     if len(numbers) + len(times) < max(2, 0.5 * len(names)):
         return
     fractions = [number for number in numbers if "." in names[number]]
+    times += [number for number in numbers if _EPOCH.fullmatch(names[number])]
     columns: dict[str, str] = {}
     example = ""
     if len(fractions) >= 2:
@@ -147,8 +149,9 @@ def _refuse_data_as_names(names: list[str], head: _Head, source: SourceFile, *, 
         first, second = float(names[x]), float(names[y])
         if abs(first) <= 90 < abs(second):
             x, y = y, x
-        others = [number for number in range(len(names)) if number not in (x, y, *times)]
-        found = [("trace_id", others[:1]), ("t", times[:1]), ("x", [x]), ("y", [y])]
+        before = [number for number in range(min(x, y)) if number not in times]
+        ids = [("vehicle_id", before[:1]), ("trace_id", before[1:2])] if len(before) > 1 else [("trace_id", before)]
+        found = [*ids, ("t", times[:1]), ("x", [x]), ("y", [y])]
         columns = {name: str(number) for name, place in found for number in place}
         degrees = max(abs(first), abs(second)) <= 180
         example = f', for example columns={json.dumps(columns)} crs="{"EPSG:4326" if degrees else "EPSG:32616"}"'
@@ -195,7 +198,8 @@ def _parse(
     wanted = _distinct_columns(names, choice, source)
     types: dict[str, pa.DataType] = {choice.columns["geometry"]: pa.string()} if "geometry" in choice.columns else {}
     types |= {choice.columns[name]: _WORDS for name in ("trace_id", "vehicle_id", "kind") if name in choice.columns}
-    if format.time_format is not None:  # digits stay as they are written, leading zeros included
+    # Digits of times stay as they are written: with leading zeros, and with the commas of a list.
+    if format.time_format is not None or (has_commas and "geometry" in choice.columns):
         types |= {name: pa.string() for name in (choice.columns.get("t"), choice.beside.get("t")) if name is not None}
     ragged: list[Any] = []
 

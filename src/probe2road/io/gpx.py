@@ -77,7 +77,15 @@ def _drives(table: pd.DataFrame, lists: dict[str, list[Any]], source: SourceFile
     """Leave out what is no drive: points without time that the OpenStreetMap server gives in no order."""
     untimed = table["t"].isna() if "t" in table else pd.Series(True, table.index)
     untimed = untimed.groupby(table["trace_id"], sort=False).transform("all")
-    if not untimed.any() or not any(_ANONYMOUS in creator.lower() for creator in lists["creator"]):
+    if not any(_ANONYMOUS in creator.lower() for creator in lists["creator"]):
+        if untimed.any():
+            logger.warning(
+                "%s: %d of %d track points have no time and count as driven in their order; points of many vehicles, "
+                "as an anonymous download gives them, are no drive: leave them out",
+                *(source.path, int(untimed.sum()), len(table)),
+            )
+        return table
+    if not untimed.any():
         return table
     what = f"{int(untimed.sum())} of {len(table)} track points of the OpenStreetMap server are anonymous"
     if untimed.all() or invalid == "refuse":

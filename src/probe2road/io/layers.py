@@ -18,7 +18,8 @@ from probe2road.io.sources import RawTable, SourceFile
 
 __all__ = ["holds_fixes", "read_layer"]
 
-_GEOMETRY = "geometry of the layer"  # the column's name in a table, which no attribute has
+_GEOMETRY = "geometry"
+_UNNAMED = "wkb_geometry"  # what pyogrio calls the shapes of formats that do not name them
 _GRAPH_LAYERS = ("edges", "nodes")  # of road graphs, ours and OSMnx's
 _TRACK_POINTS = "track_points"  # of GPX that GDAL made a GeoPackage of
 
@@ -50,8 +51,10 @@ def read_layer(source: SourceFile, format: FleetFormat | None = None, *, points:
         layer = _chosen_layer(source.path, format.layer)
         about, content = pyogrio.read_arrow(source.path, layer=layer)
         content = pa.table(content)
-        names = [_GEOMETRY if pa.types.is_binary(field.type) else field.name for field in content.schema]
-        content = content.rename_columns(names)
+        shapes = content.column(about["geometry_name"] or _UNNAMED)
+        attributes = content.drop_columns([about["geometry_name"] or _UNNAMED])
+        content = attributes.drop_columns([_GEOMETRY] * (_GEOMETRY in attributes.schema.names))
+        content = content.append_column(_GEOMETRY, shapes)
     choice = choose_columns(
         content.schema.names,
         format.columns_of(points=points),
