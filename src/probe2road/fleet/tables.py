@@ -467,7 +467,8 @@ def _degree_faults(lon: NDArray[np.float64], lat: NDArray[np.float64], checks: _
     middle = float(np.nanmedian(np.abs(lat)))
     swapped = _SWAPPED if middle > _POLAR and np.nanmax(np.abs(lon)) <= 90 else ""
     projected = (
-        '; the values look projected: pass their CRS, for example crs="EPSG:32616"'
+        '; the values look projected: pass their CRS, for example crs="EPSG:32616" (integers of 1e-6 or 1e-7 degrees '
+        "are read from columns called lat_e6 or lat_e7)"
         if max(np.nanmax(np.abs(lon)), middle) > 1000
         else ""
     )

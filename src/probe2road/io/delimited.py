@@ -7,6 +7,7 @@ import json
 import logging
 import re
 import zlib
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ _DECIMAL_COMMA = re.compile(r"(?<![\w.,])[+-]?\d+,\d+(?![\w.,])")
 _EXAMPLES_SHOWN = 3
 _COMMENTS = ("#", "//", "%")  # that lines above the table start with
 _LINES_PARSED = 20  # to find the delimiter
+_LEAST_TABLE = 3  # lines that make a table below a title
 _DATE = re.compile(r"\d{4}[-/.]?\d{2}[-/.]?\d{2}([T ]|$)|\d{1,2}[/.]\d{1,2}[/.]\d{4}")
 _EPOCH = re.compile(r"1\d{9}(?:\d{3})?(?:\.\d+)?")  # s or ms since 1970, of this century
 _NO_ID = (None, "", "NULL", "\\N")
@@ -44,7 +46,7 @@ class _Head(NamedTuple):
     """The top of a text file."""
 
     lines: list[str]  # the first lines that are neither blank nor comments above the table
-    n_above: int  # lines above the first of them
+    places: list[int]  # how many lines of the file are above each
     delimiter: str | None  # that the file states itself, as spreadsheets do in a line sep=;
     is_all: bool  # nothing follows the first line
 
@@ -77,13 +79,14 @@ def read_text_table(source: SourceFile, format: FleetFormat | None = None, *, po
     format = format or FleetFormat()
     head = _read_head(source)
     delimiter = format.delimiter or head.delimiter or _delimiter(head.lines)
+    head = _without_title(head, delimiter, source)
     names = _column_names(head, delimiter, source, header=format.header)
     if format.header and not format.columns_of(points=points):
         _refuse_data_as_names(names, head, source, points=points)
     choice = choose_columns(
         names, format.columns_of(points=points), points=points, crs=format.stated_crs, where=source.path
     )
-    skip = head.n_above + format.header
+    skip = head.places[0] + format.header
     has_commas = delimiter != "," and any(_DECIMAL_COMMA.search(line) for line in head.lines[format.header :])
     content = _parse(source, names, choice, delimiter, skip, format, has_commas=has_commas)
     origin = TableOrigin("points" if points else "traces", "line", skip + 1)
@@ -112,7 +115,8 @@ def _read_head(source: SourceFile) -> _Head:
         elif text and not text.startswith(_COMMENTS):
             break
         n_above += 1
-    below = [line for line in lines[n_above : n_above + _LINES_PARSED] if line.strip()]
+    places = [place for place in range(n_above, min(len(lines), n_above + _LINES_PARSED)) if lines[place].strip()]
+    below = [lines[place] for place in places]
     if not below:
         raise InputError("the file holds no rows", where=source.path, fix="write it again")
     try:
@@ -120,18 +124,34 @@ def _read_head(source: SourceFile) -> _Head:
     except UnicodeDecodeError as error:
         raise InputError(f"the first line is not UTF-8 ({error})", where=source.path, fix="save it as UTF-8") from error
     texts = [line.decode("utf-8-sig", errors="replace") for line in below]
-    return _Head(texts, n_above, stated, len(texts) == 1 and len(head) < _HEAD)
+    return _Head(texts, places, stated, len(texts) == 1 and len(head) < _HEAD)
 
 
 def _delimiter(lines: list[str]) -> str:
-    """Return the delimiter that gives most lines the same number of fields, two or more."""
+    """Return the delimiter that gives most lines in a row the same number of fields, two or more."""
+    return max(_DELIMITERS, key=lambda delimiter: _table_in(_widths(lines, delimiter)))
 
-    def fit(delimiter: str) -> tuple[float, int]:
-        widths = [len(cells) for cells in csv.reader(lines, delimiter=delimiter, skipinitialspace=True)]
-        alike = sum(width == widths[0] for width in widths) if widths[0] > 1 else 0
-        return alike, widths[0]
 
-    return max(_DELIMITERS, key=fit)
+def _widths(lines: list[str], delimiter: str) -> list[int]:
+    """Return the number of fields of every line."""
+    return [len(cells) for cells in csv.reader(lines, delimiter=delimiter, skipinitialspace=True)]
+
+
+def _table_in(widths: list[int]) -> tuple[int, int]:
+    """Return the length and the width of the longest run of lines with the same number of fields, two or more."""
+    runs = ((len(list(run)), width) for width, run in groupby(widths))
+    return max(((length, width) for length, width in runs if width > 1), default=(0, 1))
+
+
+def _without_title(head: _Head, delimiter: str, source: SourceFile) -> _Head:
+    """Pass over what reports write above a table: lines with at most half of the fields of the lines that follow."""
+    widths = _widths(head.lines, delimiter)
+    length, usual = _table_in(widths)
+    first = next((number for number, width in enumerate(widths) if 2 * width > usual), 0)
+    if first == 0 or len(widths) != len(head.lines) or length < _LEAST_TABLE:
+        return head
+    logger.info("%s: passed over %d lines above the table", source.path, first)
+    return head._replace(lines=head.lines[first:], places=head.places[first:])
 
 
 def _refuse_data_as_names(names: list[str], head: _Head, source: SourceFile, *, points: bool) -> None:
