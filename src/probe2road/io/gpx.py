@@ -87,12 +87,11 @@ def _drives(table: pd.DataFrame, lists: dict[str, list[Any]], source: SourceFile
         return table
     if not untimed.any():
         return table
-    what = f"{int(untimed.sum())} of {len(table)} track points of the OpenStreetMap server are anonymous"
+    fault = f"{int(untimed.sum())} of {len(table)} track points of the OpenStreetMap server are anonymous, no drive"
     if untimed.all() or invalid == "refuse":
-        fault = f"{what}: without times and order they are no drive"
-        fix = "download traces that are identifiable or trackable, each as its own file"
+        fix = "they have no times and no order: download traces that are identifiable or trackable"
         raise InputError(fault, where=source.path, fix=fix)
-    logger.warning("%s: %s, no drive: left out", source.path, what)
+    logger.warning("%s: %s: left out", source.path, fault)
     return table[~untimed].reset_index(drop=True)
 
 

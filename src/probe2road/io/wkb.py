@@ -168,15 +168,13 @@ def _positions_in_json(words: list[str | None], name: str, where: object, *, lin
     cells = pc.split_pattern(bare, ",")
     lengths = np.where(counts > 0, pc.list_value_length(cells).to_numpy(zero_copy_only=False), 0)
     width = next((int(length // count) for length, count in zip(lengths, counts, strict=True) if count), 2)
-    fault = f"column {name!r} holds no positions [x, y] or [x, y, z] that can be read"
-    fix = "write JSON such as [[13.4, 52.5], [13.5, 52.6]]"
     if width not in (2, 3) or (lengths != width * counts).any():
         bad = next(iter(np.flatnonzero(lengths != width * counts)), 0)
-        raise InputError(f"{fault} (row {bad}: {str(words[bad])[:60]})", where=where, fix=fix)
+        raise _no_positions(name, f"row {bad}: {str(words[bad])[:60]}", where)
     try:
         flat = pc.cast(pc.filter(cells, pa.array(counts > 0)).flatten(), pa.float64()).to_numpy().reshape(-1, width)
     except pa.ArrowInvalid as error:
-        raise InputError(f"{fault} ({error})", where=where, fix=fix) from error
+        raise _no_positions(name, str(error), where) from error
     if is_line or not counts.all():
         rows = np.repeat(np.arange(len(words)), counts)
         if is_line:
@@ -216,6 +214,14 @@ def _wkb_coordinates(chunk: Any, name: str, where: object) -> dict[str, NDArray[
         if (records["order"] == (order == "<")).all() and np.isin(records["code"], _POINT_CODES[length]).all():
             return {axis: records[axis].astype(np.float64) for axis in "xyz"[: length // 8]}
     raise _not_points(name, where)
+
+
+def _no_positions(name: str, reason: str, where: object) -> InputError:
+    return InputError(
+        f"column {name!r} holds no positions [x, y] or [x, y, z] that can be read ({reason})",
+        where=where,
+        fix="write JSON such as [[13.4, 52.5], [13.5, 52.6]]",
+    )
 
 
 def _not_points(name: str, where: object) -> InputError:
