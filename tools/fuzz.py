@@ -33,7 +33,7 @@ from operator import xor
 from pathlib import Path
 from typing import Any
 
-FLEET = ("csv", "parquet", "geoparquet", "gpx", "nmea", "plt", "porto", "clocks", "layer", "layer-gpkg")
+FLEET = ("csv", "parquet", "geoparquet", "gpx", "nmea", "plt", "porto", "clocks", "records", "layer", "layer-gpkg")
 GRAPH = ("graph-parquet", "geojson", "gpkg", "fgb", "shp", "graphml", "osm", "pbf", "overpass", "lines", "osmnx")
 READERS = FLEET + GRAPH
 UTM = "EPSG:32632"
@@ -215,7 +215,7 @@ def _write_other_fleets(at: dict[str, Path], drives: Any, layer: Any) -> dict[st
         return f"${body}*{reduce(xor, body.encode()):02X}\n"
 
     names = {"nmea": "drive.nmea", "plt": "drive.plt", "porto": "porto.csv", "clocks": "clocks.csv"}
-    names |= {"layer": "fixes.geojson", "layer-gpkg": "fixes.gpkg"}
+    names |= {"records": "fixes.json", "layer": "fixes.geojson", "layer-gpkg": "fixes.gpkg"}
     paths = {reader: at[reader] / name for reader, name in names.items()}
     paths["nmea"].write_text(
         "".join(
@@ -232,6 +232,7 @@ def _write_other_fleets(at: dict[str, Path], drives: Any, layer: Any) -> dict[st
     worded = drives.assign(date=drives["t"].dt.strftime("%d.%m.%Y"), time=drives["t"].dt.strftime("%H:%M:%S"))
     worded = worded.assign(lat=worded["lat"].astype(str) + "N", ew="E", **{"speed (km/h)": 32.4})
     worded.drop(columns=["t", "speed"]).to_csv(paths["clocks"], index=False, sep=";", decimal=",")
+    drives.to_json(paths["records"], orient="records", date_format="iso")
     for reader in ("layer", "layer-gpkg"):
         layer.to_file(paths[reader])
     return paths

@@ -72,3 +72,10 @@ def test_integers_that_could_be_two_things_are_refused(tmp_path: Path) -> None:
     (tmp_path / "drives.csv").write_text("lat,lon\n48100000,11500000\n")
     with pytest.raises(InputError, match=r"latitudes are outside -90\.\.90"):
         read_fleet(tmp_path / "drives.csv")
+
+
+def test_a_box_in_degrees_holds_for_integers_too(tmp_path: Path) -> None:
+    table = pd.DataFrame({"latitudeE7": [481000000, 481000000, 489000000], "longitudeE7": [115000000] * 3})
+    table.to_parquet(tmp_path / "drives.parquet", row_group_size=1)
+    fleet = read_fleet(tmp_path / "drives.parquet", bbox=(11.0, 48.0, 12.0, 48.5))
+    assert len(fleet.traces) == 2

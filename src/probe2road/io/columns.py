@@ -254,7 +254,7 @@ def _split_times(there: Sequence[str], given: ColumnMap) -> tuple[ColumnMap, dic
 
 def _columns_beside(chosen: Mapping[str, str], there: Sequence[str], degrees: bool) -> dict[str, str]:
     """Find the columns that complete others: dates for times, hemispheres for degrees."""
-    found = {}
+    found: dict[str, str] = {}
     for ours, names in _BESIDE.items():
         if ours in chosen and (degrees or ours == "t"):
             free = [column for column in there if column not in chosen.values() and normal(column) in names]

@@ -18,7 +18,7 @@ from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.formats import FleetFormat, GraphFormat
 from probe2road.io.graph_files import READABLE, read_graph
 from probe2road.io.layers import holds_fixes
-from probe2road.io.sources import FORMATS
+from probe2road.io.sources import FORMATS, format_of
 
 __all__ = ["describe_file", "describe_fleet", "describe_graph"]
 
@@ -100,8 +100,8 @@ def _holds_graph(path: Path, layer: str | None) -> bool:
             return {"u", "v", "key"} <= set(pq.read_schema(path).names)
         except (OSError, ValueError):
             return False  # the fleet reader says what is wrong with it
-    if FORMATS.get(path.suffix.lower()) == "layer":
-        return not holds_fixes(path, layer)
+    if path.is_file() and path.suffix.lower() in FORMATS:
+        return {"layer": not holds_fixes(path, layer)}.get(format_of(path), False)
     return name.endswith(tuple(READABLE))
 
 

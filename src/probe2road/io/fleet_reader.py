@@ -29,6 +29,7 @@ from probe2road.io.layers import read_layer
 from probe2road.io.nmea import read_nmea
 from probe2road.io.parquet import inside, read_parquet
 from probe2road.io.plt import read_plt
+from probe2road.io.records import read_records
 from probe2road.io.sources import RawTable, SourceFile, find_sources
 
 __all__ = ["read_fleet", "read_fleet_files"]
@@ -50,7 +51,7 @@ _DAMAGE = (
     pa.ArrowException,
 )
 # Format of `probe2road.io.sources.FORMATS` to its reader.
-_TABLES = {"parquet": read_parquet, "text": read_text_table, "layer": read_layer}
+_TABLES = {"parquet": read_parquet, "text": read_text_table, "layer": read_layer, "records": read_records}
 _RECORDINGS = {"gpx": read_gpx, "nmea": read_nmea, "plt": read_plt}  # of one layout, and of traces only
 _ROW_NUMBERS = ("id",)  # columns that number traces in some files, and rows in others
 _FEW_ROWS = 3  # of so few, ids that all differ say nothing
@@ -80,9 +81,10 @@ def read_fleet(
 
     Formats go by suffix: Parquet and GeoParquet (``.parquet``, ``.pq``, ``.geoparquet``), text tables
     (``.csv``, ``.tsv``, ``.txt``, ``.log``), GPX (``.gpx``), logs of NMEA sentences (``.nmea``, or text that begins
-    with ``$G``), GeoLife's and OziExplorer's ``.plt``, all text also with ``.gz``, and layers of points in GIS files
-    (``.gpkg``, ``.geojson``, ``.json``, ``.fgb``, ``.shp``). A folder stands for all of them in it and below; files
-    called ``points`` or ``NAME.points`` are left out of the traces, and GIS files where anything else is there.
+    with ``$G``), GeoLife's and OziExplorer's ``.plt``, JSON records (``.json``, ``.jsonl``), all text also with
+    ``.gz``, and layers of points in GIS files (``.gpkg``, ``.geojson``, ``.fgb``, ``.shp``). A folder stands for all of
+    them in it and below; files called ``points`` or ``NAME.points`` are left out of the traces, and GIS files and JSON
+    where anything else is there.
 
     Traces are told apart by their ids across all files. A file without ids is one trace called like the
     file, and in GPX every track segment is a trace called ``file/track/segment``.

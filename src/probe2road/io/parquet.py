@@ -136,6 +136,8 @@ def _row_filter(choice: ColumnChoice, about: Mapping[str, Any], schema: pa.Schem
     geometry = choice.columns.get("geometry")
     covering = about.get("covering", {}).get("bbox")
     if geometry is None:
+        if not _holds_plain_degrees(choice, schema):
+            return None
         x_min = x_max = ds.field(choice.columns["x"])
         y_min = y_max = ds.field(choice.columns["y"])
     elif pa.types.is_struct(schema.field(geometry).type):
@@ -146,3 +148,9 @@ def _row_filter(choice: ColumnChoice, about: Mapping[str, Any], schema: pa.Schem
     else:
         return None
     return (x_max >= left) & (x_min <= right) & (y_max >= bottom) & (y_min <= top)
+
+
+def _holds_plain_degrees(choice: ColumnChoice, schema: pa.Schema) -> bool:
+    """Say whether coordinates are in the file as they are in the box, not as integers, in radians or without sign."""
+    as_they_are = all(pa.types.is_floating(schema.field(choice.columns[axis]).type) for axis in "xy")
+    return (as_they_are or not choice.degrees) and not {"x", "y"} & {*choice.units, *choice.beside}

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import gzip
+import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BufferedIOBase
 from os import PathLike
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 import pandas as pd
@@ -19,7 +20,7 @@ from probe2road.errors import InputError, MissingFileError
 from probe2road.fleet.tables import TableOrigin
 from probe2road.io.atomic import settled
 
-__all__ = ["FORMATS", "POINTS_MARK", "RawTable", "SourceFile", "find_sources", "opened"]
+__all__ = ["FORMATS", "POINTS_MARK", "RawTable", "SourceFile", "find_sources", "format_of", "opened"]
 
 FORMATS = {
     **dict.fromkeys((".parquet", ".pq", ".geoparquet"), "parquet"),
@@ -27,11 +28,16 @@ FORMATS = {
     **dict.fromkeys((".gpx", ".gpx.gz"), "gpx"),
     **dict.fromkeys((".nmea", ".nmea.gz"), "nmea"),
     **dict.fromkeys((".plt", ".plt.gz"), "plt"),
-    **dict.fromkeys((".gpkg", ".geojson", ".json", ".fgb", ".shp"), "layer"),
+    **dict.fromkeys((".gpkg", ".geojson", ".fgb", ".shp"), "layer"),
+    **dict.fromkeys((".json", ".jsonl", ".ndjson", ".json.gz"), "records"),
 }
-# What text of a more general suffix is, by how it begins.
-_BEGINNINGS = {b"$G": "nmea", b"Geolife trajectory": "plt", b"OziExplorer Track": "plt"}
-_ASKED_FOR = ("layer",)  # formats of maps as well: taken out of a folder only where nothing else is in it
+# What a file of a more general suffix is, by what its first bytes hold.
+_BEGINNINGS = {
+    "text": {rb"\$G": "nmea", rb"Geolife trajectory": "plt", rb"OziExplorer Track": "plt"},
+    "records": {rb'\{.*"type"\s*:\s*"FeatureCollection"': "layer", rb'\{.*"(osm3s|elements)"\s*:': "layer"},
+}
+_HEAD = 4096  # bytes looked at
+_ASKED_FOR = ("layer", "records")  # formats of maps as well: taken out of a folder only where nothing else is in it
 POINTS_MARK = "points"  # a file called points.SUFFIX or NAME.points.SUFFIX holds semantic points
 
 
@@ -63,7 +69,7 @@ def find_sources(
 
     A folder stands for all files in it, and in the folders below, that have a supported suffix and are not
     hidden (a name that starts with ``.`` or ``_``). Files of semantic points beside the traces, by name, are
-    left out of a folder of traces, and so are GIS files, which may be maps, where anything else is in it.
+    left out of a folder of traces, and so are GIS files and JSON, which may be maps, where anything else is in it.
 
     Parameters
     ----------
@@ -108,27 +114,28 @@ def find_sources(
             files.setdefault(_existing(settled(item)), _stem(Path(item.name)))
     if len(set(files.values())) < len(files):  # files of one name: call them by their whole paths
         files = {path: path.as_posix() for path in files}
-    return [SourceFile(path, _format(path), name) for path, name in files.items()], left_out
+    return [SourceFile(path, format_of(path), name) for path, name in files.items()], left_out
 
 
-def opened(source: SourceFile) -> IO[bytes]:
+def opened(source: SourceFile) -> BufferedIOBase:
     """Open a file to read its bytes, unpacked where its suffix is .gz."""
     if source.path.suffix.lower() == ".gz":
         return gzip.open(source.path)
     return source.path.open("rb")
 
 
-def _format(path: Path) -> str:
-    """Return the format of a file, by its suffix and, of text, by its first bytes."""
+def format_of(path: Path) -> str:
+    """Return the format of a file, by its suffix and, where that is general, by its first bytes."""
     format = FORMATS[_suffix(path)]
-    if format != "text":
+    if format not in _BEGINNINGS:
         return format
     try:
         with opened(SourceFile(path, format, "")) as file:
-            head = file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()
+            head = file.read(_HEAD).removeprefix(b"\xef\xbb\xbf").lstrip()
     except (OSError, EOFError, zlib.error):
         return format  # whose reader says what is wrong
-    return next((found for beginning, found in _BEGINNINGS.items() if head.startswith(beginning)), format)
+    beginnings = _BEGINNINGS[format].items()
+    return next((found for pattern, found in beginnings if re.match(pattern, head, re.DOTALL)), format)
 
 
 def _existing(path: Path) -> Path:
