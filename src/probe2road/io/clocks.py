@@ -11,6 +11,7 @@ import itertools
 import logging
 import re
 from datetime import datetime
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -213,16 +214,17 @@ def _words(values: pd.Series) -> pd.Series:
     """Return a column as text; numbers without the fraction that a hole among integers gives them."""
     if pd.api.types.is_float_dtype(values.dtype) and (values.dropna() % 1 == 0).all():
         values = values.astype("Int64")
-    return values.astype(object).map(str, na_action="ignore").astype("str").str.strip()
+    if not isinstance(values.dtype, pd.StringDtype):
+        values = values.astype(object).map(str, na_action="ignore").astype("str")
+    return values.str.strip()
 
 
 def _numbers_in_text(values: pd.Series) -> pd.Series:
     """Return a column of text as numbers where nearly all cells are some; others become missing."""
-    words = _words(values.dropna())
-    numbers = pd.to_numeric(words.iloc[:_TRIED], errors="coerce")
-    if not len(words) or numbers.notna().mean() < _MOSTLY:
+    there = values.dropna()
+    if there.empty or pd.to_numeric(_words(there.iloc[:_TRIED]), errors="coerce").notna().mean() < _MOSTLY:
         return values
-    numbers = pd.to_numeric(words, errors="coerce").reindex(values.index)
+    numbers = pd.to_numeric(_words(there), errors="coerce").reindex(values.index)
     whole = bool((numbers.dropna() % 1 == 0).all())
     return numbers.astype("Int64") if whole else numbers.astype(np.float64)
 
@@ -230,7 +232,7 @@ def _numbers_in_text(values: pd.Series) -> pd.Series:
 def _times_from_text(values: pd.Series, name: str, where: object) -> tuple[pd.Series, str]:
     """Read times that are not in ISO 8601 by the one format that fits them; others are left as they are."""
     words = _words(values)
-    some = pd.Series(words.dropna().unique()[:_TRIED])
+    some = pd.Series(words.drop_duplicates().dropna().iloc[:_TRIED].to_numpy(), dtype="str")
     if some.empty or pd.to_datetime(some, format="ISO8601", errors="coerce", utc=True).notna().any():
         return values, ""
     if some.str.fullmatch(_TIME_OF_DAY).all():
@@ -252,7 +254,8 @@ def _times_from_text(values: pd.Series, name: str, where: object) -> tuple[pd.Se
                 where=where,
                 fix=f'say which, time_format="{first}" or time_format="{other}"',
             )
-    words = words.str.replace(_ZONE_WORD, "", regex=True)
+    if not plain.equals(some):
+        words = words.str.replace(_ZONE_WORD, "", regex=True)
     return _read(words, first, values), first
 
 
@@ -269,7 +272,23 @@ def _fitting_formats(words: pd.Series) -> list[str]:
         plausible = years.between(FIRST_YEAR, LAST_YEAR).all() or (years == 1970).all()
         return bool(plausible and times.notna().mean() >= _MOSTLY)
 
-    return [format for format in _WRITTEN if fits(format)]
+    alike = _formats_by_shape()
+    return [format for format in (*alike.get(_shape(words.iloc[0]), []), *alike["zone"]) if fits(format)]
+
+
+@cache
+def _formats_by_shape() -> dict[str, list[str]]:
+    """Sort the formats by the shape of the times that they write; those with a zone, which has many forms, apart."""
+    some_time = datetime(2024, 8, 30, 10, 20, 30, 400000)
+    found: dict[str, list[str]] = {"zone": []}
+    for format in _WRITTEN:
+        found.setdefault("zone" if "%z" in format else _shape(some_time.strftime(format)), []).append(format)
+    return found
+
+
+def _shape(text: str) -> str:
+    """Write one digit for every number and one letter for every word: few formats write times of one shape."""
+    return re.sub(r"[^\W\d_]+", "a", re.sub(r"\d+", "0", text))
 
 
 def _by_the_users_format(values: pd.Series, name: str, format: str, where: object) -> tuple[pd.Series, str]:
