@@ -18,8 +18,8 @@ from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.matching import osrm as osrm_module
 from probe2road.matching.labels import LabelOptions, cut_reference, label
 from probe2road.matching.osrm import OsrmOptions, find_osrm, osrm_network, osrm_segments, osrm_server
+from probe2road.raster.drawing import label_mask
 from probe2road.raster.grid import Grid
-from probe2road.raster.lines import label_mask
 from probe2road.simulation.drawn.generate import generate_interchange
 from probe2road.simulation.fleet_simulation import simulate
 

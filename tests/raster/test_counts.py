@@ -5,8 +5,8 @@ import pytest
 from probe2road.errors import CRSError, InputError
 from probe2road.fleet.contract import Fleet, TraceGaps, fleet_from_tables
 from probe2road.raster.counts import count_pixels, fleet_grid, rasterize, rasterize_windows
+from probe2road.raster.drawing import draw_lines
 from probe2road.raster.grid import Grid
-from probe2road.raster.lines import draw_lines
 
 CRS = "EPSG:32616"
 ORIGIN = np.array([446000.0, 4636000.0])

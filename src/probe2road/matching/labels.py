@@ -1,4 +1,4 @@
-"""Labels: reference centrelines where enough traces drive them, and masks of these.
+"""Labels: reference centrelines where enough traces drive them.
 
 A segmentation network cannot be asked for roads that its input does not show. The paper therefore keeps a reference
 centreline only where at least N = 4 traces were matched to it.

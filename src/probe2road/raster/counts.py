@@ -21,8 +21,8 @@ from scipy import ndimage
 from probe2road.crs import require_same_crs
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks, without_strays
+from probe2road.raster.drawing import draw_line
 from probe2road.raster.grid import Grid, Window, sparse_zeros
-from probe2road.raster.lines import draw_line
 
 __all__ = [
     "CHANNELS",

@@ -18,7 +18,7 @@ from probe2road.benchmark.sets.tiles import TILE_SIZE
 from probe2road.bounds import AtLeast, NotEmpty, NotNegative, Positive, Share
 from probe2road.options import checked
 from probe2road.raster.counts import count_pixels
-from probe2road.raster.lines import draw_lines
+from probe2road.raster.drawing import draw_lines
 from probe2road.training.scene import Scene, rows_around
 
 __all__ = ["Sample", "SampleOptions", "Vectors", "draw_sample", "sample_vectors", "square", "square_vectors"]

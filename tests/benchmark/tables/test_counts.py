@@ -10,8 +10,8 @@ from probe2road.metrics.geo import GeoOptions, geo_networks
 from probe2road.metrics.itopo import ItopoOptions, itopo_networks
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.soft_f1 import soft_f1
+from probe2road.raster.drawing import label_mask
 from probe2road.raster.grid import Grid
-from probe2road.raster.lines import label_mask
 
 CRS = "EPSG:32616"
 STREETS = [[(x, 100.0), (x, 2700.0)] for x in np.arange(300.0, 2700.0, 400.0)]

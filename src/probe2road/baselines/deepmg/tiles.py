@@ -18,8 +18,8 @@ from probe2road.baselines.deepmg.variants import find_variant
 from probe2road.errors import InputError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path
+from probe2road.raster.drawing import label_mask
 from probe2road.raster.grid import Grid
-from probe2road.raster.lines import label_mask
 
 __all__ = ["REGION_WIDTH", "TILE_CELLS", "Batch", "TileSet", "open_tiles", "read_batch", "tile_grids", "write_tiles"]
 

@@ -21,8 +21,8 @@ from probe2road.metrics.geo import GeoOptions, geo_samples
 from probe2road.metrics.itopo import ItopoOptions, itopo_pairs
 from probe2road.metrics.network import Network
 from probe2road.metrics.soft_f1 import soft_f1
+from probe2road.raster.drawing import label_mask
 from probe2road.raster.grid import Grid
-from probe2road.raster.lines import label_mask
 
 __all__ = ["geo_counts", "itopo_counts", "soft_counts"]
 
