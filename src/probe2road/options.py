@@ -112,7 +112,7 @@ def options_from_table(table: Mapping[str, Any], kind: type[T], *, where: object
     kind
         The dataclass; it need not be `checked` to be checked here.
     where
-        What messages call the table; the name of the class where it is None.
+        What messages call the table; the name of the class if it is None.
 
     Raises
     ------

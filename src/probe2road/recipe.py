@@ -65,11 +65,11 @@ def build(
     fleet
         From `probe2road.read_fleet`.
     options
-        The defaults where it is None.
+        None takes the defaults.
     workspace
         Folder for what every stage makes (GeoTIFF and GeoPackage). A run on the same fleet with the same
         options takes from it what an earlier run completed, down to single windows; one with other options behind
-        the segmentation takes the probability. Nothing is written where it is None.
+        the segmentation takes the probability. Nothing is written if it is None.
         `probe2road.run.workspace.resumable` gives one that goes when the work is done.
     progress
         Called as the work goes on.

@@ -50,7 +50,7 @@ def anchored(
     places
         Neighbours of each floor along the road.
     options
-        Of which ``min_drives`` is used.
+        Only ``min_drives`` is used.
     held
         Keyframes that stay, shape ``(k,)``; so do roads that one of them is on.
 

@@ -143,7 +143,7 @@ def draw_alignment(
     path
         The file.
     bounds
-        ``(left, bottom, right, top)`` in metres; the busiest square of 250 m where it is None.
+        ``(left, bottom, right, top)`` in metres; the busiest square of 250 m if it is None.
 
     Raises
     ------

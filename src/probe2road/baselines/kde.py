@@ -61,10 +61,10 @@ def build_kde(
     fleet
         From `probe2road.read_fleet`. Fixes without altitude are left out, unless none has one.
     options
-        The defaults where it is None.
+        None takes the defaults.
     workspace
         Folder for what every stage makes. A run on the same fleet with the same options takes the result from it.
-        Nothing is written where it is None.
+        Nothing is written if it is None.
     progress
         Called as the work goes on.
 

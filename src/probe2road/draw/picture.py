@@ -88,7 +88,7 @@ def write_filmstrip(
     path
         The PNG file.
     bounds
-        ``(left, bottom, right, top)`` of the area in metres; everything there is where it is None.
+        ``(left, bottom, right, top)`` of the area in metres; everything there is if it is None.
     columns
         Panels in a row; further ones start another row.
 
@@ -162,7 +162,7 @@ def draw_graph(
     reference
         Graph to draw underneath as a broad pale band, so that what the two share and miss shows.
     bounds
-        ``(left, bottom, right, top)`` of the area in metres; everything there is where it is None.
+        ``(left, bottom, right, top)`` of the area in metres; everything there is if it is None.
     title
         Heading.
     width

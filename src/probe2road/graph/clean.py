@@ -66,7 +66,7 @@ def clean_graph(graph: RoadGraph, *, options: CleanOptions | None = None) -> Roa
     graph
         Any road graph.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------

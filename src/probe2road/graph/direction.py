@@ -169,7 +169,7 @@ def counted_direction(edges: pd.DataFrame, *, options: DirectionOptions | None =
     edges
         With ``forward`` and ``backward``; missing counts are none.
     options
-        The defaults where it is None: nine drives one way, and none the other, make an edge one-way.
+        None takes the defaults: nine drives one way, and none the other, make an edge one-way.
 
     Returns
     -------

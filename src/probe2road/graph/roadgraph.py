@@ -146,9 +146,9 @@ class RoadGraph:
         Parameters
         ----------
         column
-            Edge column to colour by; one colour where it is None.
+            Edge column to colour by; one colour if it is None.
         ax
-            Axes to draw into; a new figure where it is None.
+            Axes to draw into; a new figure if it is None.
         **style
             Further arguments of ``GeoDataFrame.plot``: ``color``, ``linewidth``, ``legend``, ``figsize`` and others.
 

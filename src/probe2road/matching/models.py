@@ -14,7 +14,7 @@ __all__ = ["FLEET", "SPARSE", "PublishedModel", "RouteModel"]
 @dataclass(frozen=True)
 @checked
 class RouteModel:
-    """Matching by candidate points and the routes between them; costs are negative log probabilities.
+    """Matching by candidate points and the routes between them; costs are negative logarithms of probabilities.
 
     The defaults are those of the profile `FLEET`; `SPARSE` differs in the fields that depend on the interval.
     """
@@ -40,7 +40,7 @@ class RouteModel:
 @dataclass(frozen=True)
 @checked
 class PublishedModel:
-    """The matcher of Biagioni and Eriksson (METHOD 4.4): directed edges and a state for no road; probabilities."""
+    """The matcher of Biagioni and Eriksson (METHOD 4.4): probabilities of directed edges, and a state for no road."""
 
     step: Positive[float] = 10.0  # m, largest distance of interpolated fixes
     sigma: Positive[float] = 50.0  # m, of the complementary normal distribution

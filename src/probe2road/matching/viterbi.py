@@ -50,7 +50,7 @@ _BACKTRACK = 25.0  # m that noise may move a fix back along its edge
 
 
 class Parameters(NamedTuple):
-    """The numbers of a `RouteModel` that the kernels need; see there."""
+    """The numbers of a `RouteModel` that the compiled functions need; the fields are explained there."""
 
     tail: float
     radius: float
@@ -64,7 +64,7 @@ class Parameters(NamedTuple):
 
 
 class Observations(NamedTuple):
-    """What is known at every fix, shape (fixes,) each.
+    """The observations at every fix, shape (fixes,) each.
 
     ``t`` in s; ``sigma`` in m; ``course_x``, ``course_y`` the unit direction of driving and ``kappa`` its weight, 0
     where unknown; ``z`` in m on the datum of the graph, NaN where unknown; ``key`` marks the key fixes.
@@ -82,7 +82,7 @@ class Observations(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What is given: a network, the fixes of all traces, and the numbers of the model."""
+    """The input of the search: a network, the fixes of all traces, and the numbers of the model."""
 
     states: States
     follow: Follow
@@ -107,28 +107,28 @@ class Candidates(NamedTuple):
 
 
 class _Scores(NamedTuple):
-    """Of every candidate: the cost of the best chain that ends there, and the candidate before, `JUMP` or `NULL`."""
+    """For every candidate, the cost of the best chain that ends there, and the candidate before, `JUMP` or `NULL`."""
 
     score: NDArray[np.float64]
     back: NDArray[np.int64]
 
 
 class _Gap(NamedTuple):
-    """From one key fix to the next: the straight line (m), and how many metres a cost of one is worth."""
+    """The gap between two key fixes: its straight length (m), and the number of metres that add a cost of one."""
 
     straight: float
     beta: float
 
 
 class Decision(NamedTuple):
-    """For every key fix of one trace: its candidate or `NULL`, and whether a route leads to it from the key before."""
+    """For every key fix of a trace, its candidate or `NULL`, and whether a route leads to it from the key before."""
 
     chosen: NDArray[np.int64]
     linked: NDArray[np.bool_]
 
 
 def parameters(model: RouteModel) -> Parameters:
-    """Reduce a model to the numbers of the kernels; the cost of no road is that of a fix at ``null_distance``."""
+    """Return the numbers of a model; the cost of no road equals that of a fix at ``null_distance``."""
     null_cost = 0.5 * (model.tail + 1.0) * np.log1p((model.null_distance / model.sigma) ** 2 / model.tail)
     return Parameters(
         tail=float(model.tail),
@@ -145,7 +145,7 @@ def parameters(model: RouteModel) -> Parameters:
 
 @njit(cache=True)
 def find_candidates(problem: Problem, keys: NDArray[np.int64], scratch: Scratch) -> Candidates:
-    """Find the candidates of key fixes, given as rows of the observations, and the costs of their emissions."""
+    """Find the candidates of key fixes, given as rows of the observations, and their emission costs."""
     states, _, observed, parameters = problem
     n_keys = len(keys)
     first = np.zeros(n_keys + 1, np.int64)
@@ -178,7 +178,7 @@ def find_candidates(problem: Problem, keys: NDArray[np.int64], scratch: Scratch)
 
 @njit(cache=True)
 def _emission(problem: Problem, i: int, p: int, along: float, distance: float, reverse: int) -> float:
-    """Return the cost of seeing a fix from a point: of its distance, its course and its altitude."""
+    """Return the emission cost of a candidate for a fix: from its distance, course and altitude."""
     states, _, observed, parameters = problem
     ratio = distance / observed.sigma[i]
     cost = 0.5 * (parameters.tail + 1.0) * np.log1p(ratio * ratio / parameters.tail)
@@ -236,7 +236,7 @@ def decide(problem: Problem, candidates: Candidates, labels: Labels) -> Decision
 
 @njit(cache=True)
 def _advance(problem: Problem, candidates: Candidates, k: int, floor: float, scores: _Scores, labels: Labels) -> None:
-    """Improve the scores of the candidates of key k over routes from those of the key before.
+    """Improve the scores of the candidates of key k by routes from the candidates of the key before.
 
     Sources are taken from the best on. A target is of no use any more where its score, its emission included,
     exceeds that of the best target by a jump: from the next key on, the jump is at least as good. ``cap`` is the
@@ -289,7 +289,7 @@ def _advance(problem: Problem, candidates: Candidates, k: int, floor: float, sco
 
 @njit(cache=True)
 def _gap_before(problem: Problem, candidates: Candidates, k: int) -> _Gap:
-    """Measure from the key fix before to key k."""
+    """Measure the gap from the key fix before to key k."""
     observed, parameters = problem.observed, problem.parameters
     i, j = candidates.fix[k - 1], candidates.fix[k]
     straight = np.hypot(observed.x[j] - observed.x[i], observed.y[j] - observed.y[i])
@@ -312,14 +312,14 @@ def _route(candidates: Candidates, source: int, target: int, gap: _Gap, labels: 
 
 @njit(cache=True, inline="always")
 def _stay(candidates: Candidates, source: int, target: int, gap: _Gap) -> float:
-    """Return the cost of going between two candidates on one directed edge; noise may go back a little."""
+    """Return the cost of going between two candidates on one directed edge; noise may lead a little backwards."""
     step = candidates.progress[target] - candidates.progress[source]
     return abs(step - gap.straight) / gap.beta if step >= -_BACKTRACK else np.inf
 
 
 @njit(cache=True)
 def shortest(problem: Problem, candidates: Candidates, k: int, source: int, target: int, labels: Labels) -> bool:
-    """Search the route that `decide` found between candidates of key k - 1 and k anew, for its labels.
+    """Repeat the search for the route that `decide` found between candidates of keys k - 1 and k, to label its edges.
 
     Returns whether the route stays on one edge and needs no labels.
     """

@@ -90,7 +90,7 @@ def rasterize(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> NDA
     grid
         Where and how finely to count.
     gaps
-        Where traces are broken; the default limits where it is None.
+        Where traces are broken; the default limits if it is None.
 
     Returns
     -------

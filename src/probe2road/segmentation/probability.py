@@ -44,7 +44,7 @@ def find_segmenter(
     options
         Which segmenter, and how it works.
     weights
-        Of the network; the density segmenter where it is None.
+        Of the network; the density segmenter if it is None.
     workspace
         Where estimates are kept.
     """

@@ -39,7 +39,7 @@ def load_network(weights: Weights, *, device: str = "cpu", threads: int | None =
     device
         One of `DEVICES`.
     threads
-        At most; as many as there are cores where it is None. No influence on the result.
+        At most; as many as there are cores if it is None. No influence on the result.
 
     Raises
     ------

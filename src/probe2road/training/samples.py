@@ -149,7 +149,7 @@ def square_vectors(scene: Scene, centre: tuple[float, float], options: SampleOpt
     centre
         ``(x, y)`` in metres from the scene's origin.
     options
-        Of which only ``size`` and ``min_drives`` are used.
+        Only ``size`` and ``min_drives`` are used.
     """
     frame = _Frame(centre, _TURNS[0], options.size)
     kept = np.ones(scene.n_drives, bool)

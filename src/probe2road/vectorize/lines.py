@@ -69,7 +69,7 @@ def vectorize(
     probability
         Centreline probability of the same shape; its mean along an edge becomes the edge's ``score``.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------

@@ -119,7 +119,7 @@ def skeletonize_windows(
         Shape ``(rows, cols)``, an array, a memory map, or blocks; it is read window by window.
     out
         Boolean array, memory map or blocks of the same shape to write to; a new array, or blocks where the mask is
-        in blocks, where it is None. It must not share memory with the mask.
+        in blocks, if it is None. It must not share memory with the mask.
     window
         Side of a window, pixels.
     halo

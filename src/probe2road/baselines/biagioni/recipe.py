@@ -77,10 +77,10 @@ def build_biagioni(
     fleet
         From `probe2road.read_fleet`.
     options
-        The defaults where it is None.
+        None takes the defaults.
     workspace
         Folder for what every stage makes. A run on the same fleet with the same options takes the skeleton and the
-        result from it. Nothing is written where it is None.
+        result from it. Nothing is written if it is None.
     progress
         Called as the work goes on.
 

@@ -90,7 +90,7 @@ def thin_traces(fleet: Fleet, options: FeatureOptions | None = None, *, gaps: Tr
     fleet
         The fleet; semantic points are not used.
     options
-        The defaults where it is None.
+        None takes the defaults.
     gaps
         Where traces are broken.
 

@@ -92,7 +92,7 @@ def propose_links(graph: RoadGraph, variant: Variant, options: LinkOptions | Non
     variant
         Decides how angles are measured, and which edges a link may not touch.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------

@@ -40,7 +40,7 @@ def prune_graph(graph: RoadGraph, traversals: NDArray[np.int64], options: PruneO
     traversals
         Shape (edges, 2), from `probe2road.baselines.deepmg.traversals.count_traversals`.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------

@@ -73,7 +73,7 @@ def train(tiles: TileSet, validation: TileSet, folder: str | Path, options: Trai
         Created where it does not exist. ``weights.pt`` has the best weights so far, ``history.csv`` a line for each
         epoch, ``checkpoint.pt`` what is needed to go on.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------

@@ -82,7 +82,7 @@ def count_traversals(
     graph
         Road graph in the same CRS; all edges may be driven both ways.
     options
-        The defaults where it is None.
+        None takes the defaults.
     min_path
         Pieces of a trace that drive fewer edges than this are left out, as are single fixes.
 
