@@ -1,8 +1,8 @@
 """Junction connectivity: do roads that meet or cross in the reference connect alike? Measured by pairs of arms.
 
 Strategy. The reference is cut at its junctions and wherever two of its edges cross in plan, which is where a mask
-shows a junction, real or not. Each piece between two such places is an arm of both. For all pairs of arms of a place, the
-question is the same in each graph: is there a short route between a position on one arm and a position on the other?
+shows a junction, real or not. Each piece between two such places is an arm of both. For each pair of arms of a place,
+the question is the same in both graphs: is there a short route from a position on one arm to a position on the other?
 In the reference the positions are known; in the proposal they are on the nearest edges with about their directions.
 The length of a route is a distance between nodes, from Dijkstra's algorithm with a limit, and the rest on the edges.
 """
