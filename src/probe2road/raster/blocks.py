@@ -95,7 +95,7 @@ class Blocks:
             self._block(block)[row[place] % self.side, col[place] % self.side] = value
 
     def nonzero(self, at_least: float | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the rows and columns of all pixels that are set, or at least a given value above 0, in reading order."""
+        """Return the rows and columns of all pixels that are set, or at least ``at_least``, in reading order."""
         rows, cols = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
         for _, row_of_blocks in groupby(self._in_order(), lambda entry: entry[0][0]):
             found = []

@@ -38,7 +38,7 @@ __all__ = ["Loss", "LossOptions", "bce_dice", "cp_loss", "loss_function"]
 Loss = Callable[[Tensor, Tensor, int], Tensor]
 """Logits, target and the number of the training step (from 0) to the loss, a scalar."""
 
-_XI, _ETA = 0.25, 0.5  # factors of the weight in the Dice term (METHOD 2.1); up to 0.5 the gradient on road is never positive
+_XI, _ETA = 0.25, 0.5  # weights in the Dice term (METHOD 2.1); up to 0.5 the gradient on road is never positive
 _LIMIT = 1e4  # logits; far beyond what networks put out, and small enough to stay finite when squared and summed
 
 

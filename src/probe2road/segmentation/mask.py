@@ -36,7 +36,7 @@ class MaskOptions:
     def of(self, segmenter: Segmenter) -> tuple[float, float]:
         """Return the threshold and the seed threshold for the output of a segmenter.
 
-        A given threshold without a seed threshold raises the seed threshold of the segmenter to itself, if that is lower.
+        If only the threshold is given, the segmenter's seed threshold is raised to it where it is lower.
         """
         threshold = segmenter.threshold if self.threshold is None else self.threshold
         seed_threshold = self.seed_threshold

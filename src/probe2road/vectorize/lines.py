@@ -113,7 +113,7 @@ def graph_from_pixels(
     probability: NDArray[Any] | Blocks | None = None,
     options: VectorizeOptions | None = None,
 ) -> RoadGraph:
-    """Turn traced pixel lines into a road graph, in the same way as `vectorize`; rows and columns are those of the grid."""
+    """Turn traced pixel lines into a road graph, as `vectorize` does; rows and columns are those of the grid."""
     options = options or VectorizeOptions()
     if len(pixels.start) == 0:
         return empty_graph(grid.crs)
