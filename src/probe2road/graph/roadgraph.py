@@ -88,7 +88,7 @@ class RoadGraph:
 
     @cached_property
     def end_rows(self) -> NDArray[np.int64]:
-        """Return the rows of ``nodes`` at which the edges start and stop, shape ``(E, 2)``; if raveled, by end number."""
+        """Return the rows of ``nodes`` at which the edges start and stop, shape ``(E, 2)``; raveled, by end number."""
         rows = end_rows(self.nodes, self.edges)
         rows.setflags(write=False)
         return rows

@@ -216,18 +216,21 @@ def _contracted(
     network: Topology, length: NDArray[np.float64], short: NDArray[np.int64], hole: float
 ) -> tuple[Topology, NDArray[np.int64]]:
     """Contract edges without common nodes, each to the weighted mean of its nodes."""
-    a, b = np.minimum(network.u[short], network.v[short]), np.maximum(network.u[short], network.v[short])
+    ends = np.stack([network.u[short], network.v[short]])
+    kept_node, merged_node = ends.min(axis=0), ends.max(axis=0)
     weight, position = network.weight.copy(), network.position.copy()
-    position[a] = (weight[a, None] * position[a] + weight[b, None] * position[b]) / (weight[a] + weight[b])[:, None]
-    weight[a] += weight[b]
+    weighted = weight[:, None] * position
+    total = (weight[kept_node] + weight[merged_node])[:, None]
+    position[kept_node] = (weighted[kept_node] + weighted[merged_node]) / total
+    weight[kept_node] += weight[merged_node]
     moved_to, radius = np.arange(len(position)), np.zeros(len(position))
-    moved_to[b] = a
-    radius[a] = _FADE * np.hypot(*(network.position[a] - network.position[b]).T)
+    moved_to[merged_node] = kept_node
+    radius[kept_node] = _FADE * np.hypot(*(network.position[kept_node] - network.position[merged_node]).T)
 
     partner = np.full(len(position), -1)
-    partner[a], partner[b] = b, a
+    partner[kept_node], partner[merged_node] = merged_node, kept_node
     contracted = np.full(len(position), np.inf)
-    contracted[a], contracted[b] = length[short], length[short]
+    contracted[kept_node], contracted[merged_node] = length[short], length[short]
     # Another edge between the two nodes is the side of a hole, or becomes a loop.
     kept = ~((partner[network.u] == network.v) & (length + contracted[network.u] <= hole))
     kept[short] = False
@@ -330,7 +333,7 @@ def _copy_part(
 
 @njit(cache=True)
 def _exit(line: NDArray[np.float64], centre: NDArray[np.float64], radius: float) -> float:
-    """Return where a line first leaves a circle around its start: vertex and fraction; the last vertex if it never does."""
+    """Return where a line first leaves a circle around its start: vertex and fraction; its last vertex if never."""
     if radius == 0.0:
         return 0.0
     for place in range(len(line) - 1):

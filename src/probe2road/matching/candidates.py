@@ -66,17 +66,17 @@ def nearest_points(states: States, x: float, y: float, radius: float, query: int
     count = 0
     before = -2
     for k in range(near):
-        p = scratch.near[k]
-        share, squared = _project(states, p, x, y)
+        piece = scratch.near[k]
+        share, squared = _project(states, piece, x, y)
         distance = np.sqrt(squared)
-        new = p != before + 1 or states.edge[p] != states.edge[before]
+        new = piece != before + 1 or states.edge[piece] != states.edge[before]
         if new or distance < scratch.distance[count - 1]:
             if new:
                 count += 1
-            scratch.point[count - 1] = p
-            scratch.along[count - 1] = states.along[p] + share * states.size[p]
+            scratch.point[count - 1] = piece
+            scratch.along[count - 1] = states.along[piece] + share * states.size[piece]
             scratch.distance[count - 1] = distance
-        before = p
+        before = piece
     return count
 
 

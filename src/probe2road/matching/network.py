@@ -216,26 +216,26 @@ def _follow(
     first_dx, first_dy, last_dx, last_dy = directions
     n_states = len(head)
     first = np.zeros(n_states + 1, np.int64)
-    for d in range(n_states):
+    for directed in range(n_states):
         count = 0
-        if allowed[d]:
-            for k in range(out_first[head[d]], out_first[head[d] + 1]):
+        if allowed[directed]:
+            for k in range(out_first[head[directed]], out_first[head[directed] + 1]):
                 count += allowed[out[k]]
-        first[d + 1] = first[d] + count
+        first[directed + 1] = first[directed] + count
     state, cost = np.empty(first[-1], np.int64), np.empty(first[-1])
-    for d in range(n_states):
-        if not allowed[d]:
+    for directed in range(n_states):
+        if not allowed[directed]:
             continue
-        place = first[d]
-        low, high = out_first[head[d]], out_first[head[d] + 1]
+        place = first[directed]
+        low, high = out_first[head[directed]], out_first[head[directed] + 1]
         for k in range(low, high):
             other = out[k]
             if not allowed[other]:
                 continue
             state[place] = other
-            cosine = last_dx[d] * first_dx[other] + last_dy[d] * first_dy[other]
+            cosine = last_dx[directed] * first_dx[other] + last_dy[directed] * first_dy[other]
             cost[place] = entry[other] + turn_cost * (1.0 - cosine) / 2.0
-            if other == d ^ 1:
+            if other == directed ^ 1:
                 cost[place] += uturn_cost if high - low > 1 else uturn_cost / 2.0
             place += 1
     return Follow(first, state, cost)

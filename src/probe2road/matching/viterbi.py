@@ -208,18 +208,18 @@ def decide(problem: Problem, candidates: Candidates, labels: Labels) -> Decision
         jump = score[before] + parameters.break_cost if before >= 0 else np.inf
         enter = null_score + (parameters.break_cost / 2.0 if k > 0 else 0.0)
         floor = min(jump, enter)
-        for c in range(low, high):
-            score[c] = floor
-            back[c] = JUMP if jump < enter else NULL
+        for candidate in range(low, high):
+            score[candidate] = floor
+            back[candidate] = JUMP if jump < enter else NULL
         if k > 0:
             _advance(problem, candidates, k, floor, scores, labels)
         leave = score[before] + parameters.break_cost / 2.0 if before >= 0 else np.inf
         null_back[k] = before if leave <= null_score else NULL
         null_score = min(null_score, leave) + parameters.null_cost
-        for c in range(low, high):
-            score[c] += candidates.cost[c]
-            if best[k] < 0 or score[c] < score[best[k]]:
-                best[k] = c
+        for candidate in range(low, high):
+            score[candidate] += candidates.cost[candidate]
+            if best[k] < 0 or score[candidate] < score[best[k]]:
+                best[k] = candidate
     chosen, linked = np.full(n_keys, NULL, np.int64), np.zeros(n_keys, np.bool_)
     here = best[n_keys - 1]
     if here >= 0 and score[here] > null_score:
@@ -261,30 +261,30 @@ def _advance(problem: Problem, candidates: Candidates, k: int, floor: float, sco
         rest = states.length[origin >> 1] - candidates.progress[source]
         limit, n_wanted, kept = 0.0, 0, 0
         for place in range(n_targets):
-            c = targets[place]
-            cap = min(score[c], lowest + parameters.break_cost - candidates.cost[c])
+            target = targets[place]
+            cap = min(score[target], lowest + parameters.break_cost - candidates.cost[target])
             if cap <= base:
                 continue  # for good, because bases rise and caps fall
-            targets[kept] = c
+            targets[kept] = target
             kept += 1
-            if candidates.state[c] == origin:
-                cap = min(cap, base + _stay(candidates, source, c, gap))
+            if candidates.state[target] == origin:
+                cap = min(cap, base + _stay(candidates, source, target, gap))
             reach = straight + beta * (cap - base)
-            if rest + candidates.progress[c] <= reach:  # else no route over the end of the edge is short enough
-                limit = max(limit, reach - candidates.progress[c])
-                n_wanted += labels.wanted[candidates.state[c]] != number
-                labels.wanted[candidates.state[c]] = number
+            if rest + candidates.progress[target] <= reach:  # else no route over the end of the edge is short enough
+                limit = max(limit, reach - candidates.progress[target])
+                n_wanted += labels.wanted[candidates.state[target]] != number
+                labels.wanted[candidates.state[target]] = number
         n_targets = kept
         if n_targets == 0:
             break
         if n_wanted > 0:
             search(states, follow, RouteQuery(origin, rest, beta, limit, n_wanted), labels)
         for place in range(n_targets):
-            c = targets[place]
-            cost = base + _route(candidates, source, c, gap, labels)[0]
-            if cost < score[c]:
-                score[c], back[c] = cost, source
-                lowest = min(lowest, cost + candidates.cost[c])
+            target = targets[place]
+            cost = base + _route(candidates, source, target, gap, labels)[0]
+            if cost < score[target]:
+                score[target], back[target] = cost, source
+                lowest = min(lowest, cost + candidates.cost[target])
 
 
 @njit(cache=True)

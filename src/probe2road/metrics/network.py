@@ -159,17 +159,17 @@ def _locate(
     position, direction = np.empty((len(edge), 2)), np.empty((len(edge), 2))
     for i in range(len(edge)):
         low, high = first[edge[i]], first[edge[i] + 1]
-        b = low + np.searchsorted(along[low:high], offset[i])
-        b = min(max(b, low + 1), high - 1)
-        while b < high - 1 and along[b] == along[b - 1]:  # repeated vertices have no direction
-            b += 1
-        while b > low + 1 and along[b] == along[b - 1]:
-            b -= 1
-        size = along[b] - along[b - 1]
-        share = (offset[i] - along[b - 1]) / size if size > 0 else 0.0
+        vertex = low + np.searchsorted(along[low:high], offset[i])
+        vertex = min(max(vertex, low + 1), high - 1)
+        while vertex < high - 1 and along[vertex] == along[vertex - 1]:  # repeated vertices have no direction
+            vertex += 1
+        while vertex > low + 1 and along[vertex] == along[vertex - 1]:
+            vertex -= 1
+        size = along[vertex] - along[vertex - 1]
+        share = (offset[i] - along[vertex - 1]) / size if size > 0 else 0.0
         share = min(max(share, 0.0), 1.0)
         for axis in range(2):
-            difference = xy[b, axis] - xy[b - 1, axis]
-            position[i, axis] = xy[b, axis] if share == 1.0 else xy[b - 1, axis] + share * difference
+            difference = xy[vertex, axis] - xy[vertex - 1, axis]
+            position[i, axis] = xy[vertex, axis] if share == 1.0 else xy[vertex - 1, axis] + share * difference
             direction[i, axis] = difference / size if size > 0 else 0.0
     return position, direction

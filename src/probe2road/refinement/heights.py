@@ -138,25 +138,28 @@ def _heights_without_bias(
     and the weight of each place: how many stretches passed it, down-weighted where they disagree.
     """
     cells = pd.DataFrame({"place": place, "stretch": stretch, "z": z}).groupby(["place", "stretch"])["z"].median()
-    at, of, value = (cells.index.codes[0].astype(np.int64), cells.index.codes[1].astype(np.int64), cells.to_numpy())
-    at, of = cells.index.levels[0].to_numpy()[at], cells.index.levels[1].to_numpy()[of]
+    place_of = cells.index.levels[0].to_numpy()[cells.index.codes[0].astype(np.int64)]
+    stretch_of = cells.index.levels[1].to_numpy()[cells.index.codes[1].astype(np.int64)]
+    value = cells.to_numpy()
     n_stretches = int(stretch.max()) + 1
-    middle = pd.Series(value).groupby(at).median()
+    middle = pd.Series(value).groupby(place_of).median()
     height, bias, weight = np.full(n_places, np.nan), np.zeros(n_stretches), np.ones(len(value))
     height[middle.index.to_numpy()] = middle.to_numpy()
     sigma = options.sigma
     for _ in range(_ROUNDS):
-        away = value - height[at]
+        away = value - height[place_of]
         pull = (sigma / options.bias_sigma) ** 2
-        bias = np.bincount(of, weight * away, n_stretches) / (np.bincount(of, weight, n_stretches) + pull)
-        total = np.bincount(at, weight, n_places)
-        sums = np.bincount(at, weight * (value - bias[of]), n_places)
+        bias = np.bincount(stretch_of, weight * away, n_stretches) / (
+            np.bincount(stretch_of, weight, n_stretches) + pull
+        )
+        total = np.bincount(place_of, weight, n_places)
+        sums = np.bincount(place_of, weight * (value - bias[stretch_of]), n_places)
         height = np.divide(sums, total, out=np.full(n_places, np.nan), where=total > 0)
-        off = value - bias[of] - height[at]
+        off = value - bias[stretch_of] - height[place_of]
         sigma = max(options.sigma, _SIGMA_OF_MAD * float(np.median(np.abs(off))))
         weight = 1.0 / (1.0 + (off / (3.0 * sigma)) ** 2)
     left_over: NDArray[np.float64] = z - bias[stretch] - height[place]
-    return height, left_over, np.bincount(at, weight, n_places).astype(np.float64)
+    return height, left_over, np.bincount(place_of, weight, n_places).astype(np.float64)
 
 
 def _joined_at_nodes(

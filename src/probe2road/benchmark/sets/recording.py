@@ -238,12 +238,12 @@ def _simulate_portions(
     progress: Progress | None,
 ) -> None:
     """Drive what is missing and write it, portion by portion."""
-    number, km = 0, 0.0
+    number, driven_km = 0, 0.0
     for path in _complete(portions):
-        number, km = number + _about(path)["drives"], km + _about(path)["km"]
-    wanted, done = (amount["n_drives"], number) if amount["n_drives"] is not None else (amount["drive_km"], km)
+        number, driven_km = number + _about(path)["drives"], driven_km + _about(path)["km"]
+    wanted, done = (amount["n_drives"], number) if amount["n_drives"] is not None else (amount["drive_km"], driven_km)
     if number:
-        logger.info("going on behind drive %d (%.0f km)", number - 1, km)
+        logger.info("going on behind drive %d (%.0f km)", number - 1, driven_km)
     if wanted is not None and number and done >= wanted:
         return
     left = {name: None if value is None else value - done for name, value in amount.items()}
@@ -253,9 +253,11 @@ def _simulate_portions(
     )  # fmt: skip
     for part, chunk in enumerate(chunks, start=len(_complete(portions))):
         _write_portion(chunk, portions / f"{part:06d}", residual, seed)
-        number, km = number + len(chunk.length), km + float(chunk.length.sum()) / 1000.0
+        number, driven_km = number + len(chunk.length), driven_km + float(chunk.length.sum()) / 1000.0
         if progress is not None and wanted is not None:
-            progress("drives" if amount["n_drives"] is not None else "km", _done(amount, number, km), int(wanted))
+            progress(
+                "drives" if amount["n_drives"] is not None else "km", _done(amount, number, driven_km), int(wanted)
+            )
 
 
 def _done(amount: Mapping[str, float | None], number: int, km: float) -> int:
