@@ -1,4 +1,4 @@
-"""The recipe: fleet data in, road graph out."""
+"""The recipe: from fleet data to a road graph."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 @checked
 class BuildOptions:
-    """Everything that decides which graph comes out."""
+    """All options that determine the resulting graph."""
 
     segmentation: SegmentationOptions = field(default_factory=SegmentationOptions)  # what decides the probability
     mask: MaskOptions = field(default_factory=MaskOptions)  # which probability makes a road

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 @checked
 class KdeOptions:
-    """The parameters, of which the paper publishes none.
+    """The parameters of the method; the paper publishes none of them.
 
     The three that make the density were chosen by ``experiments/fit_kde.py``.
     """
@@ -54,7 +54,7 @@ def build_kde(
     workspace: str | Path | None = None,
     progress: Progress | None = None,
 ) -> RoadGraph:
-    """Build a road graph with three-dimensional kernel density estimation; only traces are used.
+    """Build a road graph by kernel density estimation in three dimensions, from traces only.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def build_kde(
 
 
 def _built(fleet: Fleet, grid: Grid, options: KdeOptions, work: Workspace, report: Progress) -> RoadGraph:
-    """Build the graph of a fleet from its density in space."""
+    """Build the graph of a fleet from its density in three dimensions."""
     report("density", 0, 1)
     counts = count_voxels(fleet, grid, height=options.height, gaps=options.gaps)
     pillars = dense_pillars(
