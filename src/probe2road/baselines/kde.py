@@ -66,7 +66,7 @@ def build_kde(
         Folder for what every stage makes. A run on the same fleet with the same options takes the result from it.
         Nothing is written if it is None.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------

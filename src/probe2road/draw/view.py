@@ -36,7 +36,7 @@ class Page:
     title
         Heading of the page.
     text
-        The whole page, which needs no network.
+        The whole page, which works offline.
     """
 
     title: str
@@ -95,8 +95,8 @@ def view(
 ) -> None:
     """Draw a road graph over the fleet data that it came from, as an HTML page or a picture.
 
-    The page needs no network, and shows what is known of an edge on a click. The suffix of the file decides which of
-    the two is drawn. Only counts per pixel of the fleet enter them, never a trace.
+    The suffix of the file decides which of the two is drawn. The page works offline, and a click on an edge shows its
+    attributes. Only counts per pixel of the fleet are drawn, never single traces.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ __all__ = [
     "stations_along",
 ]
 
-_SIGMA_OF_MAD = 1.4826  # ratio of a normal law
+_SIGMA_OF_MAD = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 _SAME_PLACE = 0.01  # m
 
 
@@ -292,7 +292,7 @@ def _covered(
     np.maximum.at(high, fixes.traversal, fixes.along)
     from_start, to_end = np.where(forward, entered, left), np.where(forward, left, entered)
     low, high = np.where(from_start, 0.0, low), np.where(to_end, length, high)
-    # Passed between two fixes, and not through: there is an entry or an exit, but nothing that was covered.
+    # An edge that was entered or left between two fixes, but not both: no stretch of it was covered.
     open_ended = ~np.isfinite(low) | ~np.isfinite(high)
     return np.where(open_ended, 0.0, low), np.where(open_ended, 0.0, high)
 

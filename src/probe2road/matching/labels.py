@@ -39,12 +39,12 @@ class LabelOptions:
 
     min_traces: NotNegative[int] = 4  # distinct traces; the N of the paper
     max_piece: Positive[float] = 100.0  # m; longer edges are first cut into equal pieces of at least half of this
-    min_share: Annotated[float, Above(0), AtMost(1)] = 0.5  # of a piece that a trace has to cover
+    min_share: Annotated[float, Above(0), AtMost(1)] = 0.5  # least share of a piece that a trace must cover
     matcher: Annotated[str, OneOf(*MATCHERS)] = "own"  # which matcher finds the edges of a trace
-    match: MatchOptions = field(default=MatchOptions())  # of our own matcher
+    match: MatchOptions = field(default=MatchOptions())  # options of our own matcher
     osrm: OsrmOptions = field(default=OsrmOptions())
-    osrm_url: str | None = None  # of a server that runs on the graph that osrm_network makes of the cut reference
-    osrm_folder: Path | None = None  # where OSRM's programs are, if not where find_osrm looks
+    osrm_url: str | None = None  # server that runs on the graph that osrm_network makes of the cut reference
+    osrm_folder: Path | None = None  # folder of OSRM's programs; None: where find_osrm looks
 
 
 def label(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions | None = None) -> RoadGraph:

@@ -43,8 +43,8 @@ PROFILES = ("auto", "fleet", "sparse", "published")
 class MatchOptions:
     """How traces are matched to the edges of a graph."""
 
-    profile: Annotated[str, OneOf(*PROFILES)] = "auto"  # "auto" takes "fleet" or "sparse", trace by trace
-    sparse_interval: Positive[float] = 5.0  # s, median time between fixes from which "auto" takes "sparse"
+    profile: Annotated[str, OneOf(*PROFILES)] = "auto"  # "auto" chooses "fleet" or "sparse" for each trace
+    sparse_interval: Positive[float] = 5.0  # s, median time between fixes from which "auto" chooses "sparse"
     respect_oneway: bool = True  # whether edges that driving_direction calls one-way are closed the other way
     fleet: RouteModel = field(default=FLEET)
     sparse: RouteModel = field(default=SPARSE)
@@ -76,7 +76,7 @@ class Matches:
         return f"Matches({', '.join(f'{count} {name}' for name, count in self._figures().items())})"
 
     def _repr_html_(self) -> str:
-        """Show figures in a notebook, and no id."""
+        """Show figures in a notebook, without any ids."""
         return figures_table("Matches", self._figures())
 
     def _figures(self) -> dict[str, int]:

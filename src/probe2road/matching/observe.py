@@ -16,10 +16,10 @@ from probe2road.matching.viterbi import Observations
 
 __all__ = ["observe", "sampling_interval", "seconds"]
 
-_CLOCKLESS_SPEED = 15.0  # m/s, to make up times of traces without clock
+_CLOCKLESS_SPEED = 15.0  # m/s, to estimate times of traces without a clock
 _SLOW = 2.0  # m/s, below which a receiver's heading is noise
-_AGREE = 2.0  # m, range of the altitudes of all roads near a fix, below which they tell the bias of the trace
-_BIAS_REACH = 30  # key fixes on either side that the bias at one is the median of
+_AGREE = 2.0  # m, range of the altitudes of all roads near a fix, below which they show the bias of the trace
+_BIAS_REACH = 30  # key fixes on either side, over which the median of the bias is taken
 
 
 def seconds(fleet: Fleet) -> NDArray[np.float64]:

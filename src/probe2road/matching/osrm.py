@@ -43,7 +43,7 @@ logger = logging.getLogger(__name__)
 
 _FOLDER = "PROBE2ROAD_OSRM"  # environment variable
 _TOOLS = ("osrm-extract", "osrm-partition", "osrm-customize", "osrm-routed")
-_DECIMALS = 7  # of a degree, in OSM files
+_DECIMALS = 7  # decimals of a degree in OSM files
 _START = 30.0  # s that a server may take to answer
 
 
@@ -54,8 +54,8 @@ class OsrmOptions:
 
     radius: Positive[float] = 8.0  # m, 1 sigma of fixes; it looks for roads within three times that
     min_confidence: Share = 0.5  # sub-matchings below are dropped
-    spacing: NotNegative[float] = 10.0  # m and
-    interval: NotNegative[float] = 1.0  # s that lie between two fixes that are sent, at least
+    spacing: NotNegative[float] = 10.0  # m, and
+    interval: NotNegative[float] = 1.0  # s, least distances of two fixes that are sent
     chunk: Positive[int] = 200  # fixes in a request
     overlap: NotNegative[int] = 5  # fixes that a request repeats of the one before
     vertex_spacing: Positive[float] = 20.0  # m between vertices of the network, at most: resolution of what was driven

@@ -43,8 +43,8 @@ __all__ = [
     "shortest",
 ]
 
-NULL = -1  # came from, or is, no road
-JUMP = -2  # came from the best candidate before, without a route
+NULL = -1  # no road, or reached from no road
+JUMP = -2  # reached from the best candidate before, without a route
 
 _BACKTRACK = 25.0  # m that noise may move a fix back along its edge
 
@@ -264,7 +264,7 @@ def _advance(problem: Problem, candidates: Candidates, k: int, floor: float, sco
             target = targets[place]
             cap = min(score[target], lowest + parameters.break_cost - candidates.cost[target])
             if cap <= base:
-                continue  # for good, because bases rise and caps fall
+                continue  # also for later sources, because bases rise and caps fall
             targets[kept] = target
             kept += 1
             if candidates.state[target] == origin:

@@ -58,8 +58,9 @@ class RefineOptions:
     def settled(self, *, learned: bool) -> RefineOptions:
         """Replace options that are None by defaults for learned or unlearned segmentation.
 
-        A network has learned where the middle of a road is, and what it adds to the roads are rungs and fragments that
-        nobody drives on. The lines of density lie where the traces do, and where these are few none may be matched.
+        A network has learned where the middle of a road is, so edges are not moved; its false lines are rungs and
+        fragments without drives, which are removed. The lines from density lie where the traces are; where these are
+        few, it may happen that none is matched, so edges without a match are kept.
         """
         return replace(
             self,
@@ -181,7 +182,7 @@ def refine(
         The fleet, in the graph's CRS.
     learned
         Whether the lines come from a network that has learned where the middle of a road is, or from the density of
-        traces. It settles what is None in the options; see `RefineOptions.settled`.
+        traces. It decides the value of options that are None; see `RefineOptions.settled`.
     options
         None takes the defaults.
     clean

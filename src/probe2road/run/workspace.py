@@ -46,8 +46,8 @@ __all__ = ["Workspace", "copy_segmentation", "fingerprint", "open_workspace", "r
 logger = logging.getLogger(__name__)
 
 _MARK, _LOCK = "workspace.json", "workspace.lock"
-_RUN = "probe2road_run"  # under which a file names the fingerprint of its run
-_FORMAT = 4  # raised when what a stage writes changes
+_RUN = "probe2road_run"  # name of the tag with the fingerprint of a run in its files
+_FORMAT = 4  # increased when the content of the files changes
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class Workspace:
     Attributes
     ----------
     folder
-        Where the files are, or None.
+        Folder of the files, or None.
     run, segmentation
-        Fingerprints of the run, and of what its probability depends on.
+        Fingerprints of all inputs of the run, and of those that its probability depends on.
     lock
         Held while the workspace is open.
 

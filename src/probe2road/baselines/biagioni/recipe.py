@@ -82,7 +82,7 @@ def build_biagioni(
         Folder for what every stage makes. A run on the same fleet with the same options takes the skeleton and the
         result from it. Nothing is written if it is None.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------

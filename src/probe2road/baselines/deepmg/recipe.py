@@ -77,7 +77,7 @@ def build_deepmg(
     workspace
         Folder for what the stages make, as for `probe2road.recipe.build`.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------

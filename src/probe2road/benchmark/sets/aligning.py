@@ -33,7 +33,7 @@ def align_dataset(folder: str | Path, *, workers: int = 1, progress: Progress | 
     workers
         Processes; no influence on the result beyond millimetres.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------

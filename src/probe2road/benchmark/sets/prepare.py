@@ -54,7 +54,7 @@ def prepare(
     workers
         Processes that simulate; no influence on the result.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------

@@ -67,7 +67,7 @@ def run_ablations(
     trainings
         JSON file of ``experiments/training_experiments.py``, from which the losses are compared.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------

@@ -66,7 +66,7 @@ def run_benchmark(
     deepmg
         File of DeepMG's weights; without it the method is left out.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------
