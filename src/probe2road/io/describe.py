@@ -1,4 +1,4 @@
-"""What a file holds, in figures: fleet data or a road graph."""
+"""Descriptions of files in figures: fleet data or a road graph."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def describe_graph(graph: RoadGraph) -> dict[str, Any]:
 
 
 def _holds_graph(path: Path) -> bool:
-    """Whether a file is one of a road graph: by its suffix, and for Parquet by its columns."""
+    """Tell whether a file contains a road graph: by its suffix, and for Parquet by its columns."""
     name = path.name.lower()
     if name.endswith((".parquet", ".geoparquet")):
         import pyarrow.parquet as pq

@@ -1,4 +1,4 @@
-"""Traces from GPX 1.0 and 1.1, streamed: a file is never held in memory as a tree.
+"""Reading traces from GPX 1.0 and 1.1 as a stream: a file is never held in memory as a tree.
 
 Strategy: expat calls back at the elements of a track point; the texts of positions, heights and times are
 collected in lists and converted together at the end. Routes and waypoints are no drives and are passed over.
@@ -80,7 +80,7 @@ def _parse(source: SourceFile) -> dict[str, list[Any]]:
 
 
 def _connect(parser: expat.XMLParserType, lists: dict[str, list[Any]], source: SourceFile) -> None:
-    """Let the parser fill the lists."""
+    """Connect the parser to the lists that it fills."""
     lon, lat, values = lists["lon"], lists["lat"], [lists[tag] for tag in _VALUES]
     text: list[str] = []
     state = {"track": -1, "segment": -1, "point": False, "root": False}
@@ -121,7 +121,7 @@ def _connect(parser: expat.XMLParserType, lists: dict[str, list[Any]], source: S
 
 
 def _numbers(texts: list[str | None]) -> Any:
-    """Convert texts to float64, missing ones to NaN; the texts themselves where one is no number."""
+    """Convert texts to float64, missing ones to NaN; return the texts themselves if one is not a number."""
     try:
         return np.array(["nan" if text is None else text for text in texts], np.float64)
     except ValueError:
