@@ -39,9 +39,9 @@ WGS84 = CRS.from_epsg(4326)
 
 _UTM_ZONE_WIDTH = 6.0  # degrees of longitude
 _UTM_ZONE_OVERHANG = 0.5  # degrees a data set may reach into the next zone and still use this one
-_SCALE_TOLERANCE = 2e-3  # scale error of a projection that may stay the CRS of a run
-_WANTED_TOLERANCE = 1e-2  # scale error of a projection that the user names: a neighbouring UTM zone is allowed
-_NORTH_DEGREES, _NORTH_METRES = 1e-4, 10.0  # step to the north, by which the direction of north is measured
+_SCALE_TOLERANCE = 2e-3  # of a projection that may stay the CRS of a run
+_WANTED_TOLERANCE = 1e-2  # of one that the user names: a neighbouring UTM zone is fine
+_NORTH_DEGREES, _NORTH_METRES = 1e-4, 10.0  # how far north a place is looked at to find where north is
 _UTM_LATITUDES = (-80.0, 84.0)  # degrees; outside, UTM is not defined
 
 

@@ -80,7 +80,7 @@ def _parse(source: SourceFile) -> dict[str, list[Any]]:
 
 
 def _connect(parser: expat.XMLParserType, lists: dict[str, list[Any]], source: SourceFile) -> None:
-    """Connect the parser to the lists that it fills."""
+    """Let the parser fill the lists."""
     lon, lat, values = lists["lon"], lists["lat"], [lists[tag] for tag in _VALUES]
     text: list[str] = []
     state = {"track": -1, "segment": -1, "point": False, "root": False}
