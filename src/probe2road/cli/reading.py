@@ -130,7 +130,7 @@ def fleet_options(
         typer.Option(help="Leave out fixes faster than this from their neighbours, m/s.", rich_help_panel=_FLEET),
     ] = None,
 ) -> Said[FleetFormat]:
-    """Return the description of the files of a fleet."""
+    """Return what is said of the files of a fleet."""
     from probe2road.io.formats import FleetFormat
 
     fields = {

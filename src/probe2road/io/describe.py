@@ -89,7 +89,7 @@ def describe_graph(graph: RoadGraph) -> dict[str, Any]:
 
 
 def _holds_graph(path: Path) -> bool:
-    """Tell whether a file contains a road graph: by its suffix, and for Parquet by its columns."""
+    """Whether a file is one of a road graph: by its suffix, and for Parquet by its columns."""
     name = path.name.lower()
     if name.endswith((".parquet", ".geoparquet")):
         import pyarrow.parquet as pq

@@ -43,7 +43,7 @@ CHANNELS = ("traces", "lane_markings", "road_boundaries")  # the paper's A, B, C
 _CACHED_WINDOW = 1024  # pixels; three channels of one row block stay in the processor's cache
 _KEEP = np.uint32(0xFFFFFFFF)  # all bits: lines add to the value of a pixel
 
-_MOST_PIXELS = 20_000_000_000  # where the fleet drove; one byte each fills the memory of a large computer
+_MOST_PIXELS = 20_000_000_000  # where the fleet drove; a byte each is all the memory of a large computer
 _LONGEST_SIDE = 2**31 - 1  # px, that a GeoTIFF can have
 _PLACE = 100.0  # m, side of the squares that show where the fleet drove
 

@@ -253,7 +253,7 @@ def _is_leftover(path: Path) -> bool:
 
 
 def _locked(folder: Path) -> FileLock:
-    """Lock the folder for this process; the lock of a dead process is free."""
+    """Hold the folder for this process; the lock of one that died is free."""
     lock = FileLock(folder / _LOCK)
     try:
         lock.acquire(timeout=0)

@@ -198,7 +198,7 @@ def record_fleet(
 
 
 def _open(folder: Path, run: Mapping[str, Any]) -> Path | None:
-    """Prepare the folder: return the place for the portions, or None if the same recording exists already."""
+    """Prepare the folder: where the portions go, or None if this very recording is there already."""
     make_folder(folder)
     done, portions = folder / RUN_FILE, folder / _PORTIONS
     mark = portions / RUN_FILE
