@@ -16,12 +16,11 @@ from probe2road.baselines.biagioni.traversals import Runs, good_runs, match_piec
 from probe2road.errors import OptionError
 from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
-from probe2road.graph.roadgraph import graph_from_lines
 from probe2road.matching.network import build_states
 from probe2road.matching.published import emission_table, transition
 from probe2road.raster.grid import Grid
+from sketches import UTM, graph_of
 
-CRS = "EPSG:32616"
 MODEL = BiagioniOptions().matcher
 
 
@@ -29,7 +28,7 @@ def fleet_of(*drives: list[tuple[float, float]], interval: float = 2.0) -> Fleet
     """One trip per list of positions."""
     rows = [(trip, k * interval, x, y) for trip, drive in enumerate(drives) for k, (x, y) in enumerate(drive)]
     table = pd.DataFrame(rows, columns=["trace_id", "t", "x", "y"])
-    return fleet_from_tables(table, crs=CRS, target_crs=CRS)
+    return fleet_from_tables(table, crs=UTM, keep_crs=True)
 
 
 def straight(x0: float, y0: float, x1: float, y1: float, fixes: int = 21) -> list[tuple[float, float]]:
@@ -58,13 +57,13 @@ class TestNumbersOfTheMethod:
 
     def test_transition_is_shared_by_weight_and_its_row_leaks(self) -> None:
         lines = [[(0, 0), (9, 0)], [(9, 0), (18, 0)], [(9, 0), (9, 9)]]
-        states = build_states(graph_from_lines(lines, crs=CRS))
+        states = build_states(graph_of(*lines))
         weight = np.array([3.0, 6.0, 1.0])
         onward = [transition(states, weight, 0, after) for after in (0, 1, 2, 4)]
         np.testing.assert_allclose(onward, [0.5, 1e-5, 0.6 * 0.49999, 0.1 * 0.49999])
 
     def test_vertex_in_the_middle_of_a_chain_halves_the_way_on(self) -> None:
-        states = build_states(graph_from_lines([[(0, 0), (9, 0)], [(9, 0), (18, 0)]], crs=CRS))
+        states = build_states(graph_of([(0, 0), (9, 0)], [(9, 0), (18, 0)]))
         assert transition(states, np.ones(2), 0, 2) == pytest.approx(0.249995)
         assert transition(states, np.ones(2), 0, 1) == 0.0  # nobody turns back there
 
@@ -87,7 +86,7 @@ class TestNumbersOfTheMethod:
 
 class TestDensity:
     def test_diagonal_line_carries_as_much_per_metre_as_a_straight_one(self) -> None:
-        grid = Grid.from_bounds((900, 0, 1020, 120), crs=CRS)
+        grid = Grid.from_bounds((900, 0, 1020, 120), crs=UTM)
         sums = []
         for end in ((1000.5, 20.5), (970.5, 90.5), (940.5, 20.5 + 70)):
             fleet = fleet_of([(920.5, 20.5), end])
@@ -97,7 +96,7 @@ class TestDensity:
         assert np.mean(sums) == pytest.approx(32, rel=0.05)
 
     def test_trip_counts_once_and_trips_add_up(self) -> None:
-        grid = Grid.from_bounds((900, 0, 960, 20), crs=CRS)
+        grid = Grid.from_bounds((900, 0, 960, 20), crs=UTM)
         once, there = [(905.5, 10.5), (950.5, 10.5)], [(950.5, 10.5), (905.5, 10.5)]
         single = trip_lines(fleet_of(once), grid)
         np.testing.assert_array_equal(trip_lines(fleet_of(once + there), grid), single)
@@ -105,7 +104,7 @@ class TestDensity:
 
     def test_gap_is_not_drawn(self) -> None:
         fleet = fleet_of([(905.5, 10.5), (915.5, 10.5), (1415.5, 10.5), (1425.5, 10.5)])
-        lines = trip_lines(fleet, Grid.from_bounds((900, 0, 1450, 20), crs=CRS))
+        lines = trip_lines(fleet, Grid.from_bounds((900, 0, 1450, 20), crs=UTM))
         assert (lines[:, 5:16].max(axis=0) == 32).all()
         assert not lines[:, 100:400].any()
 
@@ -122,7 +121,7 @@ class TestDensity:
         np.testing.assert_array_equal(close_with_disk(values, 3)[3:-3, 3:-3], expected[3:-3, 3:-3])
 
     def test_windows_leave_no_seam(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        grid = Grid.from_bounds((900, 0, 1080, 90), crs=CRS)
+        grid = Grid.from_bounds((900, 0, 1080, 90), crs=UTM)
         fleet = fleet_of(straight(910, 20, 1070, 70), straight(910, 60, 1070, 30), straight(990, 5, 991, 85))
         kernel = blur_kernel(2.9, 8)
         whole = level_ranks(fleet, grid, kernel, closing=8)
@@ -148,7 +147,7 @@ class TestGraySkeleton:
 
 class TestTraversals:
     # A street of two segments with a bend in the second, driven by trips on it and 30 m beside it.
-    graph = graph_from_lines([[(900, 0), (1000, 0)], [(1000, 0), (1100, 0), (1100, 100)]], crs=CRS)
+    graph = graph_of([(900, 0), (1000, 0)], [(1000, 0), (1100, 0), (1100, 100)])
 
     def runs(self, fleet: Fleet, *, blackout: float = 30.0, last_runs: bool = True) -> Runs:
         observations, pieces = observe_trips(fleet, step=10.0), straight_pieces(self.graph)
@@ -179,7 +178,7 @@ class TestTraversals:
 
     def test_without_a_clock_only_the_unknown_itself_is_left_out(self) -> None:
         traces = pd.DataFrame({"trace_id": 0, "x": np.linspace(905, 995, 10), "y": 1.0})
-        observations = observe_trips(fleet_from_tables(traces, crs=CRS, target_crs=CRS), step=10.0)
+        observations = observe_trips(fleet_from_tables(traces, crs=UTM, keep_crs=True), step=10.0)
         assert np.isnan(observations.seconds).all()
         assert len(observations.trip) == 10
 
@@ -188,7 +187,7 @@ class TestPruning:
     lines = ([(0, 0), (90, 0)], [(90, 0), (180, 0)], [(90, 0), (90, 90)])
 
     def test_two_runs_in_one_direction_keep_a_segment(self) -> None:
-        graph = graph_from_lines(self.lines, crs=CRS)
+        graph = graph_of(*self.lines)
         at = [(0.0, 0.0)]
         runs = runs_of((0, True, at), (0, True, at), (1, True, at), (1, False, at), (2, False, at), (2, False, at))
         kept, rest = prune_segments(graph, runs, min_runs=2)
@@ -198,7 +197,7 @@ class TestPruning:
         check_graph(kept)
 
     def test_nothing_left(self) -> None:
-        graph = graph_from_lines(self.lines, crs=CRS)
+        graph = graph_of(*self.lines)
         kept, rest = prune_segments(graph, runs_of((0, True, [(0.0, 0.0)])), min_runs=2)
         assert len(kept.edges) == len(kept.nodes) == len(rest.segment) == 0
 
@@ -210,14 +209,14 @@ class TestCollapse:
         np.testing.assert_allclose(run_errors(runs, np.array([0, 1]), lines), [np.sqrt(12.5), 0.0])
 
     def test_parallel_segment_becomes_a_loop_and_loops_stay(self) -> None:
-        graph = graph_from_lines([[(0, 0), (30, 0)], [(0, 0), (15, 20), (30, 0)], [(30, 0), (200, 0)]], crs=CRS)
+        graph = graph_of([(0, 0), (30, 0)], [(0, 0), (15, 20), (30, 0)], [(30, 0), (200, 0)])
         none = runs_of((2, True, [(150.0, 0.0)]))
         collapsed = collapse_segments(graph, none, max_length=35.0, max_error=12.0)
         assert collapsed.edges[["u", "v"]].to_numpy().tolist() == [[0, 0], [0, 2]]
         check_graph(collapsed)
 
     def test_long_segments_are_not_tried(self) -> None:
-        graph = graph_from_lines([[(0, 0), (60, 0)], [(60, 0), (120, 0)]], crs=CRS)
+        graph = graph_of([(0, 0), (60, 0)], [(60, 0), (120, 0)])
         none = runs_of((0, True, [(30.0, 0.0)]))
         assert len(collapse_segments(graph, none, max_length=50.0, max_error=12.0).edges) == 2
 

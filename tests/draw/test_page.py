@@ -56,7 +56,7 @@ def fleet() -> Fleet:
             "kind": ["lane_marking", "road_boundary"],
         }
     )
-    return fleet_from_tables(traces, points, crs="EPSG:32616", target_crs="EPSG:32616")
+    return fleet_from_tables(traces, points, crs="EPSG:32616", keep_crs=True)
 
 
 def embedded(page: str) -> dict[str, object]:

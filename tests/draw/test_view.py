@@ -6,14 +6,13 @@ from matplotlib.image import imread
 from probe2road.draw.view import require_drawable, view
 from probe2road.errors import InputError, OptionError, OutputError
 from probe2road.fleet.contract import fleet_from_tables
-from probe2road.graph.roadgraph import empty_graph, graph_from_lines
-
-UTM = "EPSG:32616"
+from probe2road.graph.roadgraph import empty_graph
+from sketches import UTM, graph_of
 
 
 @pytest.fixture
 def graph():
-    return graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 50)]], crs=UTM)
+    return graph_of([(0, 0), (100, 0)], [(100, 0), (100, 50)])
 
 
 def test_the_suffix_decides_between_page_and_picture(graph, tmp_path):

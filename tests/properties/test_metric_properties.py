@@ -11,10 +11,10 @@ import shapely.affinity
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.metrics import GeoOptions, evaluate, geo, itopo, junctions, lateral
+from sketches import graph_of
 
-CRS = "EPSG:32616"
 CHEAP = ["geo", "itopo", "buffer_geo", "graph_sampling"]
 
 
@@ -33,7 +33,7 @@ def street_lines(draw: st.DrawFn) -> list[list[tuple[float, float]]]:
 
 
 def graph(lines: list[Any]) -> RoadGraph:
-    return graph_from_lines(lines, crs=CRS)
+    return graph_of(*lines)
 
 
 @settings(max_examples=15, deadline=None)

@@ -18,8 +18,8 @@ from probe2road.fleet.contract import fleet_from_tables
 from probe2road.recipe import BuildOptions, build
 from probe2road.segmentation.density import DensityOptions
 from probe2road.segmentation.options import SegmentationOptions
+from sketches import UTM
 
-CRS = "EPSG:32616"
 OPTIONS = BuildOptions(segmentation=SegmentationOptions(segmenter="density", density=DensityOptions(bandwidth=5.0)))
 UNREFINED = replace(OPTIONS, refine=False)
 FEW = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -42,7 +42,7 @@ def tables(draw):
 
 
 def graph_of(table, options=OPTIONS):
-    return build(fleet_from_tables(table, crs=CRS, target_crs=CRS), options=options)
+    return build(fleet_from_tables(table, crs=UTM, keep_crs=True), options=options)
 
 
 def same(first, second, *, shift=(0.0, 0.0)):
@@ -85,9 +85,9 @@ def test_the_crs_that_the_traces_come_in_does_not_matter(other):
         pd.DataFrame({"trace_id": number, "t": np.arange(50), "x": 446000.3 + at, "y": 4636000 + at / 3 + rng.normal()})
         for number in range(10)
     )
-    here = fleet_from_tables(table, crs=CRS, target_crs=CRS)
+    here = fleet_from_tables(table, crs=UTM, keep_crs=True)
     x, y = transform(table["x"].to_numpy(), table["y"].to_numpy(), here.crs, parse_crs(other))
-    there = fleet_from_tables(table.assign(x=x, y=y), crs=other, target_crs=CRS)
+    there = fleet_from_tables(table.assign(x=x, y=y), crs=other, target_crs=UTM)
     assert np.abs(here.traces[["x", "y"]].to_numpy() - there.traces[["x", "y"]].to_numpy()).max() < 0.01
     first = shapely.get_coordinates(build(here, options=OPTIONS).edges.geometry.segmentize(1.0))
     second = build(there, options=OPTIONS).edges.geometry.to_numpy()

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from probe2road.raster.grid import Grid
 from probe2road.segmentation.segmenter import Segmenter
 from probe2road.segmentation.tiling import add_window, predict_window, raster_windows, segment_raster
-
-CRS = "EPSG:32616"
+from sketches import UTM
 
 
 def blurred(counts, grid):
@@ -30,7 +29,7 @@ def rasters(draw):
 
 
 def grid_of(rows, cols):
-    return Grid.from_bounds((446000, 4636000, 446000 + cols - 0.5, 4636000 + rows - 0.5), crs=CRS)
+    return Grid.from_bounds((446000, 4636000, 446000 + cols - 0.5, 4636000 + rows - 0.5), crs=UTM)
 
 
 @settings(max_examples=25, deadline=None)

@@ -7,8 +7,8 @@ from probe2road.fleet.contract import Fleet, TraceGaps, fleet_from_tables
 from probe2road.raster.counts import count_pixels, fleet_grid, rasterize, rasterize_windows
 from probe2road.raster.grid import Grid
 from probe2road.raster.lines import draw_lines
+from sketches import UTM
 
-CRS = "EPSG:32616"
 ORIGIN = np.array([446000.0, 4636000.0])
 
 
@@ -26,7 +26,7 @@ def fleet_of(*traces, points=()):
     if points:
         semantic = pd.DataFrame(points, columns=["x", "y", "kind"]).assign(trace_id=0, t=0)
         semantic[["x", "y"]] += 0.5 + ORIGIN
-    return fleet_from_tables(table, semantic, crs=CRS, target_crs=CRS)
+    return fleet_from_tables(table, semantic, crs=UTM, keep_crs=True)
 
 
 def counts_of(fleet, cols, rows, **options):

@@ -8,8 +8,7 @@ from probe2road.fleet.contract import fleet_from_tables
 from probe2road.raster.counts import fleet_grid, rasterize, rasterize_windows
 from probe2road.raster.grid import Grid
 from probe2road.segmentation.density import DensityOptions, density_probability, density_segmenter
-
-CRS = "EPSG:32616"
+from sketches import UTM
 
 
 def grid_of(rows, cols):
@@ -27,7 +26,7 @@ def fleet_of_lines(offsets, n_traces, *, noise=0.0, length=900.0, seed=0):
         for road, offset in enumerate(offsets)
         for number in range(n_traces)
     ]
-    return fleet_from_tables(pd.concat(traces), crs=CRS, target_crs=CRS)
+    return fleet_from_tables(pd.concat(traces), crs=UTM, keep_crs=True)
 
 
 def rows_of(probability, threshold=0.5):
