@@ -3,7 +3,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label
@@ -14,19 +13,11 @@ from probe2road.baselines.volume import Pillars, count_voxels, dense_pillars, pi
 from probe2road.baselines.volume_graph import graph_from_volume, voxel_links
 from probe2road.baselines.volume_skeleton import thin_volume
 from probe2road.errors import OptionError
-from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.raster.grid import Grid
-from sketches import UTM
+from sketches import UTM, fleet_of
 
 Volume = NDArray[np.bool_]
-
-
-def fleet_of(*drives: list[tuple[float, float, float]]) -> Fleet:
-    """One trip per list of positions in space, one each second."""
-    rows = [(trip, k, *place) for trip, drive in enumerate(drives) for k, place in enumerate(drive)]
-    table = pd.DataFrame(rows, columns=["trace_id", "t", "x", "y", "z"])
-    return fleet_from_tables(table, crs=UTM, keep_crs=True)
 
 
 def straight(x0: float, y0: float, x1: float, y1: float, z: float = 10.0) -> list[tuple[float, float, float]]:

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import shapely
 from scipy import ndimage
 
 from probe2road.errors import CRSError, InputError, MissingExtraError, OptionError
-from probe2road.fleet.contract import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.matching import osrm as osrm_module
@@ -22,7 +21,7 @@ from probe2road.raster.grid import Grid
 from probe2road.raster.lines import label_mask
 from probe2road.simulation.drawn.generate import generate_interchange
 from probe2road.simulation.fleet_simulation import simulate
-from sketches import UTM, graph_of
+from sketches import UTM, fleet_of, graph_of, spaced
 
 EAST, NORTH = 446000.0, 4636000.0  # OSRM needs coordinates that exist
 
@@ -36,13 +35,7 @@ TEE = [road((0, 0), (200, 0)), road((200, 0), (500, 0)), road((200, 0), (200, 90
 
 def fleet(*lines: list[tuple[float, float]], spacing: float = 10.0) -> Fleet:
     """Return one trace per line, with fixes at 10 m/s."""
-    tables = []
-    for name, corners in enumerate(lines):
-        line = shapely.LineString(corners)
-        xy = shapely.get_coordinates(shapely.line_interpolate_point(line, np.arange(1.0, line.length, spacing)))
-        times = pd.Timestamp("2024-01-01", tz="UTC") + pd.to_timedelta(np.arange(len(xy)) * spacing / 10.0, "s")
-        tables.append(pd.DataFrame({"trace_id": name, "t": times, "x": xy[:, 0], "y": xy[:, 1]}))
-    return fleet_from_tables(pd.concat(tables), crs=UTM, keep_crs=True)
+    return fleet_of(*(spaced(*line, spacing=spacing, start=1.0) for line in lines), interval=spacing / 10.0)
 
 
 @pytest.fixture

@@ -12,22 +12,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from probe2road.errors import CRSError, OptionError
-from probe2road.fleet.contract import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.matching.match import match
 from probe2road.refinement.centreline import CentrelineOptions, refine_centreline
-from sketches import UTM, graph_of
+from sketches import UTM, fleet_of, graph_of, spaced
 
 
 def fleet(lines: list[list[tuple[float, float]]], points: pd.DataFrame | None = None) -> Fleet:
     """Return one trace per line, a fix each 10 m and 1 s."""
-    tables = []
-    for name, corners in enumerate(lines):
-        line = shapely.LineString(corners)
-        xy = shapely.get_coordinates(shapely.line_interpolate_point(line, np.arange(5.0, line.length, 10.0)))
-        tables.append(pd.DataFrame({"trace_id": name, "t": np.arange(len(xy)), "x": xy[:, 0], "y": xy[:, 1]}))
-    return fleet_from_tables(pd.concat(tables), points, crs=UTM, keep_crs=True)
+    return fleet_of(*(spaced(*line, start=5.0) for line in lines), points=points)
 
 
 def refined(graph: RoadGraph, data: Fleet, **options: float) -> RoadGraph:

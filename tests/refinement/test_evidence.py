@@ -27,20 +27,16 @@ from probe2road.refinement.evidence import (
 from probe2road.refinement.heights import HeightOptions
 from probe2road.simulation.drawn.generate import generate_interchange
 from probe2road.simulation.fleet_simulation import simulate
-from sketches import UTM, graph_of
+from sketches import UTM, graph_of, spaced
 
 TEE = [[(0, 0), (200, 0)], [(200, 0), (400, 0)], [(200, 0), (200, 200)]]
 
 
 def drive(*corners: tuple[float, ...], name: object = 1, start: str = "2024-01-01", **columns: object) -> pd.DataFrame:
     """Return fixes each 10 m and 1 s along a line, whose heights come with it."""
-    line = shapely.LineString(corners)
-    xyz = shapely.get_coordinates(
-        shapely.line_interpolate_point(line, np.arange(5.0, line.length, 10.0)), include_z=True
-    )
-    times = pd.Timestamp(start, tz="UTC") + pd.to_timedelta(np.arange(len(xyz)), "s")
-    place = {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2]}
-    return pd.DataFrame({"trace_id": name, "t": times, **place, **columns})
+    table = pd.DataFrame(spaced(*corners, start=5.0), columns=["x", "y", "z"][: len(corners[0])])
+    times = pd.Timestamp(start, tz="UTC") + pd.to_timedelta(np.arange(len(table)), "s")
+    return table.assign(trace_id=name, t=times, **columns)
 
 
 def fleet(*drives: pd.DataFrame) -> Fleet:

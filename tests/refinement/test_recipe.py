@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pandas as pd
 import pytest
 import shapely
 
-from probe2road.fleet.contract import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.refinement.gaps.fill import GapOptions
 from probe2road.refinement.recipe import RefineOptions, refine
-from sketches import UTM, graph_of
+from sketches import fleet_of, graph_of, spaced
 
 # A road on a bridge over two others, whose mask is lost between them and has grown into both.
 LOST = [
@@ -23,14 +21,9 @@ LOST = [
 
 def drives(n: int = 6) -> Fleet:
     """Drives on the bridge, and on both roads under it."""
-    along = np.arange(-290.0, 290.0, 10.0)
-    roads = [(200.0 + along, 0.0 * along, 8.0), (100.0 + 0.0 * along, along, 0.0), (180.0 + 0.0 * along, along, 0.0)]
-    tables = [
-        pd.DataFrame({"trace_id": n * road + k, "t": np.arange(len(x)), "x": x, "y": y, "z": z})
-        for road, (x, y, z) in enumerate(roads)
-        for k in range(n)
-    ]
-    return fleet_from_tables(pd.concat(tables), crs=UTM, keep_crs=True)
+    bridge = spaced((-90, 0, 8), (480, 0, 8))
+    below = [spaced((x, -290, 0), (x, 280, 0)) for x in (100, 180)]
+    return fleet_of(*(road for road in (bridge, *below) for _ in range(n)))
 
 
 def refined(graph: RoadGraph, **gaps: float) -> RoadGraph:

@@ -5,22 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from probe2road.baselines.deepmg.features import FeatureOptions, Steps, thin_traces
 from probe2road.baselines.deepmg.pruning import PruneOptions, prune_graph
 from probe2road.baselines.deepmg.traversals import MatcherOptions, count_traversals
 from probe2road.errors import OptionError
-from probe2road.fleet.contract import fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph
-from sketches import UTM, graph_of
+from sketches import fleet_of, graph_of
 
 
 def steps(*traces: list[tuple[float, float]]) -> Steps:
-    rows = [(name, 4.0 * t, *xy) for name, trace in enumerate(traces) for t, xy in enumerate(trace)]
-    table = pd.DataFrame(rows, columns=["trace_id", "t", "x", "y"])
-    return thin_traces(fleet_from_tables(table, crs=UTM, keep_crs=True), FeatureOptions(spacing=1.0))
+    return thin_traces(fleet_of(*traces, interval=4.0), FeatureOptions(spacing=1.0))
 
 
 def with_links(graph: RoadGraph, *links: int) -> RoadGraph:

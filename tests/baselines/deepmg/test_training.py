@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import shapely
 
@@ -18,10 +17,10 @@ from probe2road.baselines.deepmg.t2rnet import T2RNet, soft_dice_loss, t2rnet_lo
 from probe2road.baselines.deepmg.tiles import TileSet, open_tiles, read_batch, tile_grids, write_tiles  # noqa: E402
 from probe2road.baselines.deepmg.training import TrainOptions, train  # noqa: E402
 from probe2road.errors import InputError, OptionError  # noqa: E402
-from probe2road.fleet.contract import Fleet, fleet_from_tables  # noqa: E402
+from probe2road.fleet.contract import Fleet  # noqa: E402
 from probe2road.graph.check import check_graph  # noqa: E402
 from probe2road.raster.counts import fleet_grid  # noqa: E402
-from sketches import UTM, graph_of  # noqa: E402
+from sketches import UTM, fleet_of, graph_of, spaced  # noqa: E402
 
 QUICK = TrainOptions(width=2, epochs=2, learning_rate=0.01, validate_every=1)
 
@@ -29,13 +28,8 @@ QUICK = TrainOptions(width=2, epochs=2, learning_rate=0.01, validate_every=1)
 @pytest.fixture(scope="module")
 def drives() -> Fleet:
     """Two streets of 1 km that cross, driven five times each."""
-    along = np.arange(12.0, 1000.0, 12.0)
-    ways = [np.stack([along, np.full(len(along), 300.0)], 1), np.stack([np.full(len(along), 500.0), along], 1)]
-    tables = [
-        pd.DataFrame({"trace_id": name, "t": np.arange(len(along)) * 0.8, "x": way[:, 0], "y": way[:, 1]})
-        for name, way in enumerate(ways * 5)
-    ]
-    return fleet_from_tables(pd.concat(tables), crs=UTM, keep_crs=True)
+    ways = [spaced((12, 300), (1000, 300), spacing=12.0), spaced((500, 12), (500, 1000), spacing=12.0)]
+    return fleet_of(*ways * 5, interval=0.8)
 
 
 @pytest.fixture(scope="module")

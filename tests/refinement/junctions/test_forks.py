@@ -1,18 +1,17 @@
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 import pytest
 import shapely
 from numpy.typing import NDArray
 
 from probe2road.errors import OptionError
-from probe2road.fleet.contract import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.match import match
 from probe2road.refinement.junctions.forks import ForkOptions, find_forks, move_forks
-from sketches import UTM, graph_of
+from sketches import fleet_of, graph_of
 
 PARTS = 100.0  # m, where the ramp leaves
 SEEN = 150.0  # m, where the mask saw it leave
@@ -29,15 +28,10 @@ def drives(
 ) -> Fleet:
     """Every second drive leaves at `leaves`; those that do keep `lane` metres right of the others before."""
     rng = np.random.default_rng(5)
-    tables = []
-    for drive in range(2 * n):
-        x = np.arange(4.0, 400.0, 8.0)
-        y = ramp(x - leaves + PARTS) - lane if drive % 2 else np.zeros(len(x))
-        y = y + rng.normal(0.0, noise, len(x))
-        if backwards:
-            x, y = x[::-1], y[::-1]
-        tables.append(pd.DataFrame({"trace_id": drive, "t": np.arange(len(x)), "x": x, "y": y}))
-    return fleet_from_tables(pd.concat(tables), crs=UTM, keep_crs=True)
+    x = np.arange(4.0, 400.0, 8.0)
+    ways = [np.zeros(len(x)), ramp(x - leaves + PARTS) - lane] * n
+    driven = [np.stack([x, y + rng.normal(0.0, noise, len(x))], axis=1) for y in ways]
+    return fleet_of(*(way[:: -1 if backwards else 1] for way in driven))
 
 
 def moved(graph: RoadGraph, fleet: Fleet, **options: float) -> RoadGraph:
@@ -79,11 +73,7 @@ def test_a_lane_that_leads_to_a_ramp_is_not_the_ramp() -> None:
     """Those who leave change lanes from 40 m on and have one of their own from 80 m on; the ramp leaves at 120 m."""
     x = np.arange(2.0, 400.0, 4.0)
     away = np.interp(x, [40.0, 80.0, 120.0, 400.0], [0.0, -3.5, -3.5, -31.5])
-    tables = [
-        pd.DataFrame({"trace_id": k, "t": np.arange(len(x)), "x": x, "y": away if k % 2 else np.zeros(len(x))})
-        for k in range(12)
-    ]
-    fleet = fleet_from_tables(pd.concat(tables), crs=UTM, keep_crs=True)
+    fleet = fleet_of(*[np.stack([x, 0 * x], axis=1), np.stack([x, away], axis=1)] * 6)
     graph = graph_of(*LATE)
     assert fork_of(moved(graph, fleet))[0] == pytest.approx(120.0, abs=8.0)
     assert fork_of(moved(graph, fleet, max_lane=2.5))[0] < 90.0
@@ -112,11 +102,8 @@ def test_the_two_forks_of_a_short_road_share_it() -> None:
     lines += [[(40, 0), (48, 4), (240, 8)], [(40, 0), (48, -4), (240, -8)]]
     graph = graph_of(*lines)
     x = np.arange(-196.0, 240.0, 4.0)
-    table = [
-        pd.DataFrame({"trace_id": k, "t": np.arange(len(x)), "x": x, "y": (k % 2 * 2 - 1) * np.abs(x - 20.0) / 8.0})
-        for k in range(12)
-    ]
-    result = moved(graph, fleet_from_tables(pd.concat(table), crs=UTM, keep_crs=True))
+    ways = [np.stack([x, side * np.abs(x - 20.0) / 8.0], axis=1) for side in (-1, 1)]
+    result = moved(graph, fleet_of(*ways * 6))
     assert len(find_forks(graph).node) == 2
     assert 10.0 <= result.edges["length"].iloc[2] <= 40.0
 

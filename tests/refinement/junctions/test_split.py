@@ -13,7 +13,7 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.match import match
 from probe2road.refinement.junctions.passages import node_passages, passing_positions
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
-from sketches import UTM, graph_of
+from sketches import UTM, fleet_of, graph_of, spaced
 
 NOT_MERGED = DisambiguateOptions(merge=False)
 LITERAL = DisambiguateOptions(variant="literal", merge=False)
@@ -271,15 +271,11 @@ class TestPositions:
             assert found[["x", "y", "z"]].to_numpy()[0] == pytest.approx(expected, abs=1e-6, nan_ok=True)
 
     def test_far_fixes_say_nothing(self) -> None:
-        table = pd.DataFrame({"trace_id": 1, "t": [0, 4], "x": [-80.0, 80.0], "y": 0.0, "z": 5.0})
-        fleet = fleet_from_tables(table, crs=UTM, keep_crs=True)
+        fleet = fleet_of([(-80.0, 0.0, 5.0), (80.0, 0.0, 5.0)], interval=4.0)
         assert passing_positions(CROSS, fleet, match(CROSS, fleet))["z"].isna().all()
 
     def test_other_graph(self) -> None:
-        fleet = fleet_from_tables(
-            pd.DataFrame({"trace_id": 1, "t": range(9), "x": np.arange(-80.0, 81.0, 20), "y": 0.0}),
-            crs=UTM, keep_crs=True,
-        )  # fmt: skip
+        fleet = fleet_of(spaced((-80, 0), (80, 0), spacing=20.0))
         matches = match(CROSS, fleet)
         other = graph_of([(0, 0), (90, 0)])
         with pytest.raises(InputError, match="nodes that are not in the graph"):
