@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.raster.grid import Grid
 
 UTM = "EPSG:32616"
+EAST, NORTH = 446_000.0, 4_636_000.0  # a place in it, for what asks whether coordinates can be true
 
 
 def graph_of(*lines: ArrayLike | shapely.LineString) -> RoadGraph:
@@ -65,6 +67,15 @@ def spaced(*corners: ArrayLike, spacing: float = 10.0, start: float = 0.0) -> ND
     line = shapely.LineString(np.asarray(corners, float))
     along = np.arange(start, line.length + 1e-6, spacing)
     return shapely.get_coordinates(shapely.line_interpolate_point(line, along), include_z=line.has_z)
+
+
+def grid_of(rows: int, cols: int) -> Grid:
+    """Return a grid of pixels of 1 m.
+
+    >>> grid_of(3, 5).shape
+    (3, 5)
+    """
+    return Grid.from_bounds((EAST, NORTH, EAST + cols - 0.5, NORTH + rows - 0.5), crs=UTM)
 
 
 def mask_of(*rows: str) -> NDArray[np.bool_]:

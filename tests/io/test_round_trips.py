@@ -16,9 +16,7 @@ from probe2road.graph.direction import driving_direction, in_driving_direction
 from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.io.graph_files import WRITABLE, read_graph, write_graph
 from probe2road.io.graph_networkx import from_networkx, to_networkx
-from sketches import UTM, graph_of
-
-EAST, NORTH = 446000.0, 4636000.0
+from sketches import EAST, NORTH, UTM, graph_of
 
 
 @pytest.fixture

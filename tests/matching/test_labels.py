@@ -21,12 +21,11 @@ from probe2road.raster.grid import Grid
 from probe2road.raster.lines import label_mask
 from probe2road.simulation.drawn.generate import generate_interchange
 from probe2road.simulation.fleet_simulation import simulate
-from sketches import UTM, fleet_of, graph_of, spaced
-
-EAST, NORTH = 446000.0, 4636000.0  # OSRM needs coordinates that exist
+from sketches import EAST, NORTH, UTM, fleet_of, graph_of, spaced
 
 
 def road(*corners: tuple[float, float]) -> list[tuple[float, float]]:
+    """Move a line to a place that exists, which OSRM asks for."""
     return [(EAST + x, NORTH + y) for x, y in corners]
 
 

@@ -4,13 +4,8 @@ from scipy import ndimage
 
 from probe2road.errors import OptionError
 from probe2road.raster.counts import fleet_grid, rasterize, rasterize_windows
-from probe2road.raster.grid import Grid
 from probe2road.segmentation.density import DensityOptions, density_probability, density_segmenter
-from sketches import fleet_of
-
-
-def grid_of(rows, cols):
-    return Grid(446000.0, 4636000.0, 1.0, rows, cols, fleet_of_lines([0.0], 1).crs)
+from sketches import fleet_of, grid_of
 
 
 def fleet_of_lines(offsets, n_traces, *, noise=0.0, length=900.0, seed=0):
