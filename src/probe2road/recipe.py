@@ -143,7 +143,7 @@ def _built(
             learned=weights is not None,
             options=options.refinement,
             clean=options.clean,
-            workspace=work,
+            keep=work.write_graph,
             progress=report,
         )
     return graph

@@ -30,7 +30,6 @@ from probe2road.refinement.junctions.split import DisambiguateOptions, split_fal
 from probe2road.refinement.undriven import RungOptions, drop_undriven
 from probe2road.run.progress import Progress, silent
 from probe2road.run.stages import GAPS_FILLED, Stage
-from probe2road.run.workspace import Workspace
 
 __all__ = ["RefineOptions", "refine"]
 
@@ -168,7 +167,7 @@ def refine(
     learned: bool,
     options: RefineOptions | None = None,
     clean: CleanOptions | None = None,
-    workspace: Workspace | None = None,
+    keep: Callable[[Stage, RoadGraph], object] | None = None,
     progress: Progress | None = None,
 ) -> RoadGraph:
     """Fill gaps, split false junctions, move forks and count drives, all by matching traces to the graph.
@@ -186,8 +185,8 @@ def refine(
         The defaults where it is None.
     clean
         How the graph is cleaned once its gaps are filled.
-    workspace
-        Where the graph with filled gaps is kept.
+    keep
+        Called with each stage of `probe2road.run.stages` that is reached, and the graph as it is then.
     progress
         Called with the number of steps that are done.
 
@@ -216,7 +215,7 @@ def refine(
     >>> refine(straight, fleet, learned=False).edges["support"].notna().tolist()
     [True]
     """
-    options, work = (options or RefineOptions()).settled(learned=learned), workspace or Workspace()
+    options = (options or RefineOptions()).settled(learned=learned)
     report = progress or silent
     if graph.edges.empty:
         return graph
@@ -235,8 +234,8 @@ def refine(
             logger.info("%s: %d nodes and %d edges", step.name, len(result.nodes), len(result.edges))
             matches = None
         graph = result
-        if step.stage is not None:
-            work.write_graph(step.stage, graph)
+        if step.stage is not None and keep is not None:
+            keep(step.stage, graph)
         report("refinement", number, len(_STEPS))
     return replace(graph, edges=in_driving_direction(graph.edges))  # last, because matches follow the lines
 
