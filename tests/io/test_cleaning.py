@@ -12,8 +12,7 @@ from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import Fleet
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.formats import FleetFormat
-
-UTM = "EPSG:32616"
+from sketches import UTM
 
 
 def drive(n: int = 40, **columns: object) -> pd.DataFrame:
