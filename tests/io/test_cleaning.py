@@ -12,8 +12,7 @@ from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import Fleet
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.formats import FleetFormat
-
-UTM = "EPSG:32616"
+from sketches import UTM
 
 
 def drive(n: int = 40, **columns: object) -> pd.DataFrame:
@@ -281,3 +280,8 @@ def test_a_first_line_of_data_shows_the_columns(tmp_path: Path, line: str, colum
     with pytest.raises(InputError) as caught:
         written(tmp_path, f"{line}\n{line}\n")
     assert f'columns={columns} crs="EPSG:4326"' in str(caught.value)
+
+
+def test_rows_may_end_with_a_delimiter(tmp_path: Path) -> None:
+    lines = "".join(f"1,2024-05-01 08:00:0{row},48.1,11.50{row},\n" for row in ROWS)
+    assert len(written(tmp_path, f"trip,time,lat,lon\n{lines}").traces) == 6

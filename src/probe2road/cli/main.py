@@ -406,7 +406,7 @@ def train(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line; an error of ours is one message and exit code 2, a result with nothing in it code 3."""
+    """Run the command line; an error of ours gives one message and exit code 2, an empty result exit code 3."""
     # How much to say is said to the program, but may stand anywhere.
     arguments = sorted(sys.argv[1:] if arguments is None else arguments, key=lambda word: word not in _VOLUME)
     try:
@@ -422,7 +422,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _require_places(*outputs: Path | None) -> None:
-    """Refuse files that cannot be written where they are to go, before any work, and two outputs of one name."""
+    """Refuse output paths that cannot be written, and two outputs of one name, before any work."""
     from probe2road.io.atomic import require_place
 
     named = [path for path in outputs if path is not None]
@@ -434,7 +434,7 @@ def _require_places(*outputs: Path | None) -> None:
 
 
 def _require_folders(*outputs: Path | None) -> None:
-    """Refuse a file where a folder is to go; one that is not there is created when it is written."""
+    """Refuse a file in the place of an output folder; a missing folder is created when it is written."""
     for path in outputs:
         if path is not None and path.exists() and not path.is_dir():
             raise OutputError("is a file, and a folder would be written", where=path, fix="choose another name")

@@ -1,4 +1,4 @@
-"""How a user says on the command line what files look like: options declared once, shared by all verbs that read.
+"""Options of the command line that describe input files: declared once, shared by all commands that read.
 
 A group of options is a function: its parameters are the options, and it returns what was `Said`. `takes` puts the
 options of a group in the place of one parameter of a verb, so that the help of the verb shows them and the verb gets
@@ -74,7 +74,7 @@ _FLEET, _GRAPH, _REFERENCE = "How to read the fleet data", "How to read the grap
 
 @dataclass(frozen=True)
 class Said(Generic[Format]):
-    """What the command line says of the files of a fleet, or of a graph."""
+    """The description of the files of a fleet, or of a graph, on the command line."""
 
     kind: type[Format]
     table: str  # the table of a TOML file that says the rest
@@ -185,7 +185,7 @@ def graph_options(
         ),
     ] = False,
 ) -> Said[GraphFormat]:
-    """Return what is said of the file of a graph."""
+    """Return the description of the file of a graph."""
     from probe2road.io.formats import GraphFormat
 
     flags = {"layer": "--layer", "crs": "--graph-crs", "inner_junctions": "--no-inner-junctions"}
@@ -210,7 +210,7 @@ def reference_options(
         ),
     ] = False,
 ) -> Said[GraphFormat]:
-    """Return what is said of the file of a reference graph."""
+    """Return the description of the file of a reference graph."""
     from probe2road.io.formats import GraphFormat
 
     flags = {
@@ -226,7 +226,7 @@ def reference_options(
 def takes(
     *, without: Collection[str] = (), **groups: Callable[..., Said[Any]]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a verb options in groups: typer sees all options, the verb gets one object for each group.
+    """Give a command options in groups: typer sees all options, the command gets one object for each group.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ def takes(
 
 
 def chosen_format(said: Said[Format], config: dict[str, Any] | None = None, *, where: object = None) -> Format:
-    """Return the format of a TOML file, with what the command line says in the place of its fields.
+    """Return the format from a TOML file, with fields replaced by those from the command line.
 
     Parameters
     ----------
@@ -299,7 +299,7 @@ def chosen_format(said: Said[Format], config: dict[str, Any] | None = None, *, w
 def read_roads(
     path: Path, said: Said[GraphFormat], *, format: GraphFormat | None = None, target_crs: Any = None
 ) -> RoadGraph:
-    """Read a road graph; errors name the flags of this graph, of which a verb may take several.
+    """Read a road graph; errors name the options of this graph, because a command may read several graphs.
 
     Parameters
     ----------
@@ -323,7 +323,7 @@ def read_roads(
 
 
 def spoken(message: str, flags: Mapping[str, str] = FLAGS) -> str:
-    """Put the arguments in a message of the library into flags of the command line.
+    """Replace the names of arguments in a message of the library by options of the command line.
 
     Arguments stand in messages as a Python caller writes them. Other arguments, and what only looks like one, stay.
 
@@ -361,7 +361,7 @@ def four_numbers(text: str, option: str) -> tuple[float, float, float, float]:
 
 
 def _parameters(function: Callable[..., Any], *, unseen: Collection[str] = ()) -> list[Parameter]:
-    """Return the parameters of a function by keyword, annotations resolved but for those that typer does not see.
+    """Return the parameters of a function as keyword-only, with annotations resolved except those hidden from typer.
 
     Unseen ones, and what the function returns, have types that are not imported before a verb runs.
     """
@@ -384,7 +384,7 @@ def _column_map(text: str | None, option: str) -> dict[str, str] | None:
 
 
 def _word(value: Any) -> str:
-    """Write a value as a flag takes it, with the space before it; a flag that is a switch takes none."""
+    """Return a value in the form for an option, with a space before it; a switch has no value."""
     if isinstance(value, bool):
         return ""
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""What a receiver wrote that cannot be true, and traces that are several: unknown, left out or cut, never silently."""
+"""Cleaning of fleet data: impossible values become unknown, bad fixes are left out, joined traces are cut."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _CONTRADICTION = 60.0  # degrees between heading and movement, in the median of 
 
 
 def plausible_headings(table: pd.DataFrame, origin: TableOrigin, *, where: object = None) -> pd.DataFrame:
-    """Take headings and speeds for unknown that stand for "not available": -1, 511, and what is out of range.
+    """Set headings and speeds to unknown that stand for "not available": -1, 511, and values out of range.
 
     Headings are 0 to 360 degrees, or -180 to 180 where there are negative ones other than -1.
 
@@ -63,7 +63,7 @@ def plausible_headings(table: pd.DataFrame, origin: TableOrigin, *, where: objec
 
 
 def accurate_fixes(table: pd.DataFrame, max_accuracy: float, *, where: object = None) -> pd.DataFrame:
-    """Leave out fixes that say themselves that they are less accurate, in metres; unknown accuracies are kept.
+    """Leave out fixes with a recorded accuracy worse than a limit, in metres; unknown accuracies are kept.
 
     Raises
     ------
@@ -158,7 +158,7 @@ def cut_traces(
 
 
 def _steps(traces: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return east and north of the step to every fix, and whether the fix before is of the same trace."""
+    """Return the step to every fix, east and north, and whether the fix before belongs to the same trace."""
     same = np.zeros(len(traces), bool)
     same[1:] = traces["trace_id"].array[1:] == traces["trace_id"].array[:-1]
     east, north = (np.diff(traces[axis].to_numpy(), prepend=np.nan) for axis in "xy")
@@ -166,7 +166,7 @@ def _steps(traces: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 
 def _without_jumps(traces: pd.DataFrame, max_speed: float) -> pd.DataFrame:
-    """Leave out fixes with an impossible step before and behind them, a few rounds for neighbours."""
+    """Leave out fixes with an impossible step before and after them, in a few rounds for neighbours."""
     n = len(traces)
     for _ in range(10):
         east, north, same = _steps(traces)
@@ -187,7 +187,7 @@ def _without_jumps(traces: pd.DataFrame, max_speed: float) -> pd.DataFrame:
 
 
 def _with_true_headings(traces: pd.DataFrame) -> pd.DataFrame:
-    """Take the headings of a trace for unknown that contradict its movement: constants, radians, other zeros."""
+    """Set the headings of a trace to unknown that contradict its movement: constants, radians, other zeros."""
     east, north, same = _steps(traces)
     heading: Any = traces["heading"].to_numpy()
     moving = same & (np.hypot(east, north) > _MOVING) & np.isfinite(heading)

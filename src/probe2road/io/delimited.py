@@ -192,7 +192,9 @@ def _column_names(head: _Head, delimiter: str, source: SourceFile, *, header: bo
     cells = [cell.strip() for cell in next(csv.reader(head.lines[:1], delimiter=delimiter))]
     if not header:
         return [str(number) for number in range(len(cells))]
-    return cells
+    rows = head.lines[1:]
+    has_no_name = all(line.endswith(delimiter) for line in rows) and _table_in(_widths(rows, delimiter))[1]
+    return [*cells, ""] if has_no_name == len(cells) + 1 else cells  # every row ends with a delimiter, the names do not
 
 
 def _distinct_columns(names: list[str], choice: ColumnChoice, source: SourceFile) -> list[str]:

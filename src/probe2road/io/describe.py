@@ -1,4 +1,4 @@
-"""What a file holds, in figures: fleet data or a road graph."""
+"""Descriptions of files in figures: fleet data or a road graph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Traces from GPX 1.0 and 1.1, streamed: a file is never held in memory as a tree.
+"""Reading traces from GPX 1.0 and 1.1 as a stream: a file is never held in memory as a tree.
 
 Strategy: expat calls back at the elements of a track point; the texts of positions, heights and times are
 collected in lists and converted together at the end. Routes and waypoints are no drives and are passed over.
@@ -157,7 +157,7 @@ def _connect(parser: expat.XMLParserType, lists: dict[str, list[Any]], source: S
 
 
 def _numbers(texts: list[str | None]) -> Any:
-    """Convert texts to float64, missing ones to NaN; the texts themselves where one is no number."""
+    """Convert texts to float64, missing ones to NaN; return the texts themselves if one is not a number."""
     try:
         return np.array(["nan" if text is None else text for text in texts], np.float64)
     except ValueError:

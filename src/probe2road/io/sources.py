@@ -1,4 +1,4 @@
-"""Which files to read, what format each has, and what its traces are called."""
+"""The files to read, the format of each, and the names of its traces."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class SourceFile:
 
 @dataclass(frozen=True)
 class RawTable:
-    """What is in a file, unchecked: our column names, the file's types."""
+    """The unchecked content of a file: our column names, the file's types."""
 
     table: pd.DataFrame
     crs: CRS | None  # that the file itself states
@@ -65,7 +65,7 @@ class RawTable:
 def find_sources(
     source: str | PathLike[str] | Sequence[str | PathLike[str]], *, semantic_points: bool = False
 ) -> tuple[list[SourceFile], list[Path]]:
-    """List the files of fleet data that a path stands for, in order of their names.
+    """List the files of fleet data in a path, sorted by name.
 
     A folder stands for all files in it, and in the folders below, that have a supported suffix and are not
     hidden (a name that starts with ``.`` or ``_``). Files of semantic points beside the traces, by name, are
@@ -139,7 +139,7 @@ def format_of(path: Path) -> str:
 
 
 def _existing(path: Path) -> Path:
-    """Return the path of a file that can be read."""
+    """Return the path of a file, or refuse one that cannot be read."""
     if not path.exists():
         raise MissingFileError("there is no such file or folder", where=path, fix="check the path")
     if _suffix(path) not in FORMATS:
@@ -162,7 +162,7 @@ def _supported_files(folder: Path) -> list[Path]:
 
 
 def _is_marked(path: Path) -> bool:
-    """Say whether a file calls itself one of semantic points."""
+    """Tell whether the name of a file says that it contains semantic points."""
     return _stem(Path(path.name)).split(".")[-1].lower() == POINTS_MARK
 
 

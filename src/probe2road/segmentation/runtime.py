@@ -1,4 +1,4 @@
-"""Networks without torch: a weights file run by onnxruntime."""
+"""Networks without torch: weights files run by onnxruntime."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ __all__ = ["DEVICES", "LoadedNetwork", "load_network", "run_network"]
 DEVICES = ("cpu", "cuda")
 
 _ERRORS_ONLY = 3  # severity from which onnxruntime writes to standard error
-# One algorithm for all runs and full single precision, so that a GPU repeats itself and agrees with the CPU.
+# One algorithm for all runs, in full single precision, so that results of a GPU are repeatable and agree with the CPU.
 _CUDA = ("CUDAExecutionProvider", {"cudnn_conv_algo_search": "HEURISTIC", "use_tf32": "0"})
 
 
 @dataclass(frozen=True)
 class LoadedNetwork:
-    """A network ready to run."""
+    """A network that is ready to run."""
 
     info: ModelInfo
     session: onnxruntime.InferenceSession
 
 
 def load_network(weights: Weights, *, device: str = "cpu", threads: int | None = None) -> LoadedNetwork:
-    """Make a network ready to run.
+    """Load a network so that it is ready to run.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def load_network(weights: Weights, *, device: str = "cpu", threads: int | None =
     device
         One of `DEVICES`.
     threads
-        At most; as many as there are cores where it is None. No influence on the result.
+        At most; as many as there are cores if it is None. No influence on the result.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def run_network(network: LoadedNetwork, tiles: NDArray[np.float32]) -> NDArray[n
 
 
 def _providers(device: str) -> list[Any]:
-    """Return what onnxruntime calls the device."""
+    """Return the names by which onnxruntime calls a device."""
     if device not in DEVICES:
         raise OptionError(f"there is no device {device!r}", fix=f"use {' or '.join(DEVICES)}")
     if device == "cpu":

@@ -1,4 +1,4 @@
-"""Segmenters on areas of any size: window by window, overlapping windows merged.
+"""Segmenters on areas of any size: window by window, with overlapping windows merged.
 
 Strategy
 --------
@@ -29,7 +29,7 @@ from probe2road.segmentation.segmenter import Segmenter
 
 __all__ = ["add_window", "predict_window", "raster_windows", "segment_raster"]
 
-_STEPS = 2.0**24  # of the probability between 0 and 1: as many as single precision tells apart everywhere
+_STEPS = 2.0**24  # of the probability between 0 and 1: single precision can represent all of them
 
 
 def segment_raster(segmenter: Segmenter, counts: NDArray[Any], grid: Grid) -> NDArray[np.float32]:
@@ -100,7 +100,7 @@ def raster_windows(counts: NDArray[Any], grid: Grid, *, size: int, halo: int) ->
 
 
 def predict_window(segmenter: Segmenter, window: Window, counts: NDArray[Any], grid: Grid) -> NDArray[np.float32]:
-    """Return what a segmenter says about a window: its pixels, or with blending those of the halo too.
+    """Return the output of a segmenter for a window: its own pixels or, with blending, the pixels of the halo, too.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def add_window(
 
 
 def _overlap(window: Window, shape: tuple[int, int]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Return the pixels of a window and its halo that an area has: in the area, and in the window's own array."""
+    """Return which pixels of a window and its halo lie in an area: rows and columns in the area and in the window."""
     target, source = [], []
     for first, count, length in zip((window.row, window.col), (window.rows, window.cols), shape, strict=True):
         start = first - window.halo
@@ -170,7 +170,7 @@ def _neighbours(first: int, length: int, segmenter: Segmenter) -> tuple[int, int
 
 @lru_cache(maxsize=32)
 def _share(size: int, halo: int, rows: tuple[int, int], cols: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the part that a window has in each of its pixels and those of its halo; parts of all windows sum to 1.
+    """Return the weight of a window in each of its pixels and those of its halo; weights of all windows sum to 1.
 
     ``rows`` and ``cols`` are how many windows before and after overlap with it along the axes.
     """
@@ -188,5 +188,5 @@ def _share(size: int, halo: int, rows: tuple[int, int], cols: tuple[int, int]) -
 
 
 def _shifted(shift: int, side: int) -> tuple[slice, slice]:
-    """Return where two tiles overlap along an axis, in either's pixels, if the other lies ``shift`` pixels ahead."""
+    """Return where two tiles overlap along an axis, in the pixels of each; the second is ``shift`` pixels ahead."""
     return slice(max(0, shift), side + min(0, shift)), slice(max(0, -shift), side - max(0, shift))
