@@ -24,7 +24,7 @@ from probe2road.io.columns import ColumnChoice, standard_kinds
 from probe2road.io.formats import FleetFormat
 from probe2road.io.sources import RawTable
 from probe2road.io.units import UNITS, in_our_unit, normal
-from probe2road.io.wkb import Places, point_coordinates, text_coordinates
+from probe2road.io.wkb import PositionsInText, point_coordinates, text_coordinates
 
 __all__ = ["raw_table"]
 
@@ -118,10 +118,10 @@ def raw_table(
     return RawTable(pd.DataFrame(table, copy=False), crs, degrees, origin, guessed, skipped)
 
 
-def _places(column: pa.ChunkedArray, name: str, *, lines: bool, where: object) -> tuple[Places, _Lines | None]:
+def _places(column: pa.ChunkedArray, name: str, *, lines: bool, where: object) -> tuple[PositionsInText, _Lines | None]:
     """Unpack a column of points, or of lines in text."""
     if not (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)):
-        return Places(point_coordinates(column, name=name, where=where), None, None), None
+        return PositionsInText(point_coordinates(column, name=name, where=where), None, None), None
     places = text_coordinates(column, name=name, lines=lines, where=where)
     if places.rows is None:
         return places, None

@@ -57,20 +57,8 @@ USUAL_NAMES: dict[str, tuple[str | None, ...]] = {
     "z": ("z", "alt", "altitude", "ele", "elevation", "elev", "gpsaltitude", "gpsalt", None, "height"),
     "vehicle_id": (
         *("vehicleid", "vehicle", "veh", "vehid", "vin", "deviceid", "taxiid", "taxi", "busid", "bus", "cabid"),
-        *(
-            "truckid",
-            "userid",
-            "user",
-            "driverid",
-            "imei",
-            "unitid",
-            "agentid",
-            "devid",
-            "assetid",
-            "carid",
-            "cab",
-            "car",
-        ),
+        *("truckid", "userid", "user", "driverid", "imei", "unitid", "agentid", "devid", "assetid", "carid"),
+        *("cab", "car"),
         *("licenseplate", "licenceplate", "plate", "vehiclename", "devicename", "terminalid", "driver", "truck"),
         *(None, "device", "uid", "participant"),
     ),
@@ -89,15 +77,8 @@ _NOT_ASKED = ("vehicle_id", "heading", "speed", "accuracy")
 _LON_LAT = (
     (
         *("lon", "lng", "long", "longitude", "gpslon", "gpslng", "gpslong", "gpslongitude", "rawlng", "rawlon"),
-        *(
-            "locationlon",
-            "locationlng",
-            "locationlong",
-            "locationlongitude",
-            "decimallongitude",
-            "wgs84lon",
-            "lonwgs84",
-        ),
+        *("locationlon", "locationlng", "locationlong", "locationlongitude", "decimallongitude", "wgs84lon"),
+        *("lonwgs84"),
         *("coordslongitude", "longitud", "laengengrad", "längengrad"),
     ),
     (

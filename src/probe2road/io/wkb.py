@@ -21,7 +21,7 @@ from pyproj import CRS
 from probe2road.crs import parse_crs
 from probe2road.errors import InputError
 
-__all__ = ["Places", "point_coordinates", "text_coordinates"]
+__all__ = ["PositionsInText", "point_coordinates", "text_coordinates"]
 
 _POINT, _LINE = 0, 1  # type ids of shapely; -1 is a missing geometry
 _FIXES_OF_LINES = "write one row per fix, with a point each (lines have no times)"
@@ -30,7 +30,7 @@ _FIXES_OF_LINES = "write one row per fix, with a point each (lines have no times
 _POINT_CODES = {21: (1,), 29: (1001, 0x80000001)}
 
 
-class Places(NamedTuple):
+class PositionsInText(NamedTuple):
     """The positions in a column of text."""
 
     axes: dict[str, NDArray[np.float64]]  # x, y, and z where any position has a height
@@ -88,7 +88,9 @@ def _with_holes(chunk: Any, name: str, where: object) -> dict[str, NDArray[np.fl
     return whole
 
 
-def text_coordinates(column: pa.ChunkedArray, *, name: str, lines: bool = False, where: object = None) -> Places:
+def text_coordinates(
+    column: pa.ChunkedArray, *, name: str, lines: bool = False, where: object = None
+) -> PositionsInText:
     """Return the coordinates of a column of text: WKT, WKB in hexadecimal digits, GeoJSON, or JSON arrays of positions.
 
     Parameters
@@ -102,7 +104,7 @@ def text_coordinates(column: pa.ChunkedArray, *, name: str, lines: bool = False,
 
     Returns
     -------
-    Places
+    PositionsInText
         Positions in float64 arrays: as many as rows, or as the lines have; and the CRS that a prefix ``SRID=4326;`` or
         extended WKB names.
 
@@ -144,16 +146,16 @@ def text_coordinates(column: pa.ChunkedArray, *, name: str, lines: bool = False,
         positions, rows = shapely.get_coordinates(
             shapes, include_z=bool(shapely.has_z(shapes).any()), return_index=True
         )
-        return Places(dict(zip("xyz", positions.T, strict=False)), crs, rows, first[:1] == "{")
+        return PositionsInText(dict(zip("xyz", positions.T, strict=False)), crs, rows, first[:1] == "{")
     if not np.isin(kinds, (_POINT, -1)).all():
         raise _not_points(name, where)
     axes = {"x": shapely.get_x(shapes), "y": shapely.get_y(shapes)}
     if shapely.has_z(shapes).any():
         axes["z"] = shapely.get_z(shapes)
-    return Places(axes, crs, None, first[:1] == "{")
+    return PositionsInText(axes, crs, None, first[:1] == "{")
 
 
-def _positions_in_json(words: list[str | None], name: str, where: object, *, lines: bool) -> Places:
+def _positions_in_json(words: list[str | None], name: str, where: object, *, lines: bool) -> PositionsInText:
     """Read ``[lon, lat]`` or ``[[lon, lat], ...]``, all rows at once.
 
     Strategy: brackets say how many positions a row has, and are then taken out; what is left is one list of numbers.
@@ -178,11 +180,11 @@ def _positions_in_json(words: list[str | None], name: str, where: object, *, lin
     if is_line or not counts.all():
         rows = np.repeat(np.arange(len(words)), counts)
         if is_line:
-            return Places(dict(zip("xyz", flat.T, strict=False)), None, rows, in_json=True)
+            return PositionsInText(dict(zip("xyz", flat.T, strict=False)), None, rows, in_json=True)
         whole = np.full((len(words), width), np.nan)
         whole[rows] = flat
         flat = whole
-    return Places(dict(zip("xyz", flat.T, strict=False)), None, None, in_json=True)
+    return PositionsInText(dict(zip("xyz", flat.T, strict=False)), None, None, in_json=True)
 
 
 def _coordinates(chunk: Any, name: str, where: object) -> dict[str, NDArray[np.float64]]:
