@@ -160,3 +160,15 @@ def test_errors_name_the_flag_that_helps(folder, capsys, words, hint):
     code, _, err = call(capsys, *words)
     assert code == 2
     assert hint in err
+
+
+def test_the_layer_of_the_traces_beside_that_of_the_graph(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fixes = gpd.GeoDataFrame(
+        {"trip": 1, "time": range(30)}, geometry=[shapely.Point(446000 + 10 * t, 4636000) for t in range(30)], crs=32616
+    )
+    for layer in ("monday", "tuesday"):
+        fixes.to_file(folder / "week.gpkg", layer=layer)
+    words = ("match", "week.gpkg", "city.gpkg", "--layer", "streets", "-o", "m.parquet")
+    code, _, err = call(capsys, *words)
+    assert (code, "--traces-layer monday" in err) == (2, True)
+    assert call(capsys, *words, "--traces-layer", "tuesday")[0] == 0

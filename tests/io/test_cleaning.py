@@ -224,11 +224,13 @@ def test_speeds_of_another_unit_are_told_by_the_movement(
     assert f"taken as {unit}; say the unit in the name of the column" in caplog.text
 
 
-@pytest.mark.parametrize("speed", [10.0, 15.0, 50.0, 0.0])
-def test_speeds_of_no_unit_stay_as_they_are(tmp_path: Path, caplog: pytest.LogCaptureFixture, speed: float) -> None:
+@pytest.mark.parametrize(("speed", "warned"), [(10.0, False), (15.0, False), (50.0, True), (2.8, True), (0.0, False)])
+def test_speeds_of_no_unit_stay_as_they_are(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, speed: float, warned: bool
+) -> None:
     assert read(tmp_path, drive(speed=speed)).traces["speed"].tolist() == [speed] * 40
     assert read(tmp_path, drive(10, speed=36.0)).traces["speed"].tolist() == [36.0] * 10  # too few to say
-    assert "the movement" not in caplog.text
+    assert ("check their unit" in caplog.text) == warned
 
 
 ROWS = range(6)

@@ -20,6 +20,7 @@ from probe2road.cli.reading import (
     fleet_options,
     four_numbers,
     graph_options,
+    read_drives,
     read_roads,
     reference_options,
     spoken,
@@ -199,7 +200,6 @@ def match(
     config: Annotated[Path | None, typer.Option(help="TOML file with matching options, and how to read.")] = None,
 ) -> None:
     """Match traces to the edges of a road graph."""
-    from probe2road.io.fleet_reader import read_fleet
     from probe2road.io.graph_files import graph_format as format_of_graph
     from probe2road.io.graph_files import write_graph
     from probe2road.io.table_writer import GEO_SUFFIXES, require_table_suffix, write_table
@@ -220,7 +220,7 @@ def match(
     options = options_from_table(table, MatchOptions, where=config)
     options = replace(options, profile=profile) if profile else options
     network = read_roads(graph, graph_format, format=roads_format, target_crs=format.target_crs)
-    fleet = read_fleet(traces, format=format, target_crs=network.crs)
+    fleet = read_drives(traces, format=format, target_crs=network.crs)
     matches = match_fleet(network, fleet, options=options)
     placed = output.suffix.lower() in GEO_SUFFIXES
     write_table(matched_points(matches, network) if placed else matches.fixes, output, layer="matches")
@@ -308,13 +308,12 @@ def view(
     """Draw a road graph over its traces: one HTML page that needs no network, or a picture."""
     from probe2road.draw.view import require_drawable
     from probe2road.draw.view import view as draw
-    from probe2road.io.fleet_reader import read_fleet
 
     require_drawable(output)
     _require_places(output)
     format = chosen_format(fleet_format)
     roads = read_roads(graph, graph_format, target_crs=format.target_crs)
-    fleet = read_fleet(traces, points, format=format, target_crs=roads.crs) if traces else None
+    fleet = read_drives(traces, points, format=format, target_crs=roads.crs) if traces else None
     compared = read_roads(reference, reference_format) if reference else None
     draw(roads, output, fleet=fleet, reference=compared, title=title or graph.name, min_drives=min_drives)
 

@@ -23,6 +23,7 @@ import typer
 from probe2road.errors import OptionError, Probe2RoadError
 
 if TYPE_CHECKING:
+    from probe2road.fleet.contract import Fleet
     from probe2road.graph.roadgraph import RoadGraph
     from probe2road.io.formats import FleetFormat, GraphFormat
 
@@ -33,6 +34,7 @@ __all__ = [
     "fleet_options",
     "four_numbers",
     "graph_options",
+    "read_drives",
     "read_roads",
     "reference_options",
     "spoken",
@@ -319,6 +321,27 @@ def read_roads(
         return read_graph(path, format=replace(format, target_crs=format.target_crs or target_crs))
     except Probe2RoadError as error:
         error.args = (spoken(str(error), said.flags),)
+        raise
+
+
+def read_drives(traces: Path, points: Path | None = None, *, format: FleetFormat, target_crs: Any = None) -> Fleet:
+    """Read fleet data for a verb that takes a graph as well; errors name the flags of the fleet.
+
+    Parameters
+    ----------
+    traces, points
+        Files or folders.
+    format
+        What the command line and a TOML file say of them.
+    target_crs
+        Metric CRS to work in, in the place of the format's.
+    """
+    from probe2road.io.fleet_reader import read_fleet
+
+    try:
+        return read_fleet(traces, points, format=format, target_crs=target_crs)
+    except Probe2RoadError as error:
+        error.args = (spoken(str(error), {**FLAGS, "layer": "--traces-layer"}),)
         raise
 
 

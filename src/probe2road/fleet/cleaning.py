@@ -28,6 +28,7 @@ _MANY_STEPS = 20  # moving steps, below which the unit of speeds is not judged
 _LONGEST_STEP = 10.0  # s; in longer ones a vehicle turns and stops, so that its speed tells nothing of the step
 _LIKE = 0.06  # share by which speeds may differ from those in a unit; knots and miles per hour are 0.14 apart
 _SPREAD = 0.3  # share by which half of the ratios of speed to movement may differ from the median
+_IMPLAUSIBLE = 2.0  # ratio of speed to movement, above which or below whose inverse a unit is wrong
 _OTHER_UNITS = {"km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}  # m/s
 _CONTRADICTION = 60.0  # degrees between heading and movement, in the median of a trace
 
@@ -206,7 +207,7 @@ def _with_true_headings(traces: pd.DataFrame) -> pd.DataFrame:
 
 
 def _with_true_speeds(traces: pd.DataFrame) -> pd.DataFrame:
-    """Convert speeds that are those of the movement in another unit; the name of their column did not say it."""
+    """Convert speeds that are those of the movement in another unit, and warn of those that cannot be in any."""
     east, north, same = _steps(traces)
     step = np.hypot(east, north)
     seconds = traces["t"].diff().dt.total_seconds().to_numpy()
@@ -226,4 +227,6 @@ def _with_true_speeds(traces: pd.DataFrame) -> pd.DataFrame:
                 *(middle, unit),
             )
             return traces.assign(speed=speed * factor)
+    if not 1 / _IMPLAUSIBLE <= middle <= _IMPLAUSIBLE:
+        logger.warning("speeds are %.2f times those of the movement: check their unit", middle)
     return traces
