@@ -77,6 +77,26 @@ def test_columns_that_the_user_names_have_units_too(tmp_path: Path) -> None:
     assert fleet.traces["speed"].tolist() == pytest.approx([10.0] * 5)
 
 
+@pytest.mark.parametrize(
+    ("column", "cell", "ours", "expected"),
+    [
+        ("Speed", "36 km/h", "speed", 10.0),
+        ("Speed", "19,44 kn", "speed", 10.0),
+        ("Course", "90°", "heading", 90.0),
+        ("Altitude", "1000 ft", "z", 304.8),
+    ],
+)
+def test_cells_that_name_their_unit_are_read_in_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, column: str, cell: str, ours: str, expected: float
+) -> None:
+    lines = LINES.replace(",", ";").replace(";36\n", f";{cell}\n")
+    (tmp_path / "drives.csv").write_text(f"trip;time;lon;lat;{column}\n{lines}")
+    with caplog.at_level(logging.INFO):
+        values = read_fleet(tmp_path / "drives.csv").traces[ours]
+    assert values.tolist() == pytest.approx([expected] * 5, abs=3.0 if ours == "heading" else 0.01)
+    assert f"{ours} in " in caplog.text
+
+
 def test_an_unknown_unit_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "drives.csv").write_text(f"trip,time,lon,lat,speed (furlongs)\n{LINES}")
     assert read_fleet(tmp_path / "drives.csv").traces["speed"].tolist() == [36.0] * 5

@@ -385,12 +385,12 @@ def train(
 
     An interrupted run goes on where it stopped when it is started again. Needs the extra 'train'.
     """
+    _require_folders(output)
     from probe2road.training.config import load_config
     from probe2road.training.finish import export_best
     from probe2road.training.loop import is_first, use_threads
     from probe2road.training.loop import train as run_training
 
-    _require_folders(output)
     chosen = load_config(config)
     if threads is not None:
         use_threads(threads)

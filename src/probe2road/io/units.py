@@ -72,6 +72,7 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 UNITS = {**UNITS, "y": UNITS["x"]}
 
 _LAST_BRACKETS = re.compile(r"[\[({]([^\[\](){}]*)[\])}]\s*$")
+_MEASUREMENT = re.compile(r"^\s*(?P<number>[+-]?\d+(?:[.,]\d+)?)\s*(?P<unit>[^\s\d.,].*?)\s*$")
 _NO_UNITS = ("wgs84", "epsg4326", "utc", "gmt", "gps", "iso8601", "truenorth", "msl", "raw", "filtered")
 
 
@@ -136,7 +137,7 @@ def in_our_unit(
     Parameters
     ----------
     values
-        Numbers; cells that are none stay as they are, ``23.5 kn`` too.
+        Numbers, or words of a number and its unit (``23.5 kn``); other cells stay as they are.
     ours, header
         Our name of the column, and the file's.
     unit
@@ -157,6 +158,11 @@ def in_our_unit(
     dtype: float64, 'kmh')
     >>> in_our_unit(pd.Series([36, 72]), "speed", "speed", None)[0].tolist()
     [36, 72]
+    >>> in_our_unit(pd.Series(["36 km/h", "10 m/s", "?"]), "speed", "speed", None)
+    (0    10.0
+    1    10.0
+    2       ?
+    dtype: object, 'kmh, ms')
     """
     units = UNITS[ours]
     if unit is None:
@@ -165,7 +171,7 @@ def in_our_unit(
             logger.warning(
                 "%s: the unit of column %r (%s) is not known: the numbers count as they are", where, header, ours
             )
-        return values, ""
+        return _cells_in_our_unit(values, units)
     if units[unit] == 1.0:
         return values, ""
     numbers = pd.to_numeric(values, errors="coerce")
@@ -174,3 +180,17 @@ def in_our_unit(
         return values, ""
     scaled = (numbers * units[unit]).astype(np.float64)
     return (scaled.astype(object).mask(unreadable, values) if unreadable.any() else scaled), unit
+
+
+def _cells_in_our_unit(values: pd.Series, units: Mapping[str, float]) -> tuple[pd.Series, str]:
+    """Convert the cells that name their unit behind their number."""
+    if pd.api.types.is_numeric_dtype(values.dtype):
+        return values, ""
+    parts = values.astype("str").str.extract(_MEASUREMENT)
+    unit = parts["unit"].str.replace("°", "deg").map(normal, na_action="ignore")
+    known = unit.isin(list(units)).to_numpy()
+    if not known.any():
+        return values, ""
+    numbers = pd.to_numeric(parts["number"].str.replace(",", "."), errors="coerce") * unit.map(units)
+    converted = values.astype(object).mask(known, numbers)
+    return converted if not known.all() else numbers.astype(np.float64), ", ".join(sorted(set(unit[known])))

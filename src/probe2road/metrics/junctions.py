@@ -233,7 +233,8 @@ def _connected(
     found = np.flatnonzero((edge[one] >= 0) & (edge[other] >= 0))
     if len(found) == 0:
         return connected
-    start_edge, start, stop_edge, stop = (values[rows[found]] for rows in (one, other) for values in (edge, offset))
+    start_edge, start = edge[one[found]], offset[one[found]]
+    stop_edge, stop = edge[other[found]], offset[other[found]]
     # The four routes from an end of the one edge to an end of the other, shape (4, K), and that along the same edge.
     (exit_node, to_exit), (entry, from_entry) = _ends(network, start_edge, start), _ends(network, stop_edge, stop)
     exit_node, to_exit = exit_node[[0, 0, 1, 1]], to_exit[[0, 0, 1, 1]]
