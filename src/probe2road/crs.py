@@ -328,7 +328,7 @@ def extents_apart(first: Placed, second: Placed) -> tuple[str, str] | None:
     >>> here, near, away = (graph_from_lines([[(x, 4e6), (x + 9, 4e6)]], crs="EPSG:32616") for x in (0, 99, 5e5))
     >>> extents_apart(here, near)
     >>> extents_apart(here, away)
-    ('-92.5357..-92.5356 E, 36.0417..36.0417 N', '-87.0000..-86.9999 E, 36.1447..36.1447 N')
+    ('-92.5461..-92.5460 E, 36.0162..36.0162 N', '-87.0000..-86.9999 E, 36.1447..36.1447 N')
     """
     if not np.isfinite([first.bounds, second.bounds]).all():
         return None

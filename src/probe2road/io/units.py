@@ -184,7 +184,7 @@ def in_our_unit(
 
 def _cells_in_our_unit(values: pd.Series, units: Mapping[str, float]) -> tuple[pd.Series, str]:
     """Convert the cells that name their unit behind their number."""
-    if pd.api.types.is_numeric_dtype(values.dtype):
+    if not pd.api.types.is_string_dtype(values):
         return values, ""
     parts = values.astype("str").str.extract(_MEASUREMENT)
     unit = parts["unit"].str.replace("°", "deg").map(normal, na_action="ignore")
