@@ -95,7 +95,7 @@ def test_a_file_without_a_network_is_an_error(tmp_path, runtime):
     pytest.importorskip(runtime)
     path = tmp_path / "empty.onnx"
     path.write_bytes(pack_weights(b"", ModelInfo("empty", ("traces",))))
-    with pytest.raises(InputError, match=r"empty\.onnx: (onnxruntime cannot load the weights|the network does not take)"):
+    with pytest.raises(InputError, match=r"empty\.onnx: (onnxruntime cannot load|the network does not take)"):
         load_network(read_weights(path), runtime=runtime)
 
 
