@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from probe2road import evaluate, graph_from_lines, read_fleet, read_graph, read_network, write_graph
+from probe2road import evaluate, read_fleet, read_graph, read_network, write_graph
 from probe2road.errors import (
     CRSError,
     InputError,
@@ -22,6 +22,7 @@ from probe2road.errors import (
     needs_extra,
 )
 from probe2road.segmentation.weights import read_weights
+from sketches import graph_of
 
 
 def test_a_missing_package_names_the_extra_to_install():
@@ -93,7 +94,7 @@ def test_a_worker_process_sends_its_error_as_it_was_raised(tmp_path):
 
 
 def test_users_of_other_libraries_catch_what_they_expect(tmp_path):
-    graph = graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616")
+    graph = graph_of([(0, 0), (100, 0)])
     private = replace(graph, edges=graph.edges.assign(vehicle_id=1))
     for read in (read_fleet, read_graph, read_network, read_weights):
         with pytest.raises(FileNotFoundError):
@@ -108,12 +109,12 @@ def test_users_of_other_libraries_catch_what_they_expect(tmp_path):
 
 def test_a_crs_that_a_file_records_wrongly_is_named(tmp_path):
     path = tmp_path / "roads.geojson"
-    write_graph(graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616"), path)
+    write_graph(graph_of([(0, 0), (100, 0)]), path)
     path.write_text(path.read_text().replace("EPSG:32616", "EPSG:1"))
     with pytest.raises(CRSError, match="is not a coordinate reference system"):
         read_graph(path)
     path = tmp_path / "roads.osm"
-    write_graph(graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616"), path)
+    write_graph(graph_of([(0, 0), (100, 0)]), path)
     path.write_text(path.read_text().replace("EPSG:32616", "EPSG:1"))
     with pytest.raises(CRSError, match="is not a coordinate reference system"):
         read_graph(path)

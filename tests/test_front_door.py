@@ -26,8 +26,8 @@ from matplotlib.figure import Figure
 import probe2road as p2r
 from probe2road.draw import view as draw_view
 from probe2road.draw.view import Page
+from sketches import UTM
 
-UTM = "EPSG:32616"
 VERBS = ("read_fleet", "simulate", "align", "build", "refine", "match", "label", "evaluate", "view", "write_graph")
 VERBS += ("read_graph", "write_fleet", "describe_fleet", "describe_graph", "rasterize", "clean_graph", "add_drives")
 VERBS += ("read_network", "find_preset", "fleet_from_tables", "graph_from_lines", "check_graph", "from_networkx")

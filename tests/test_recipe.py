@@ -2,14 +2,12 @@ import logging
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from probe2road.errors import InputError, OptionError, OutputError
-from probe2road.fleet.contract import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.check import check_graph
 from probe2road.graph.clean import CleanOptions
-from probe2road.graph.roadgraph import graph_from_lines
 from probe2road.io.graph_files import read_graph
 from probe2road.metrics import evaluate
 from probe2road.raster.grid import read_raster
@@ -17,8 +15,8 @@ from probe2road.recipe import BuildOptions, build
 from probe2road.run.workspace import fingerprint
 from probe2road.segmentation.density import DensityOptions, density_probability
 from probe2road.segmentation.options import SegmentationOptions
+from sketches import fleet_of, graph_of, spaced
 
-CRS = "EPSG:32616"
 ORIGIN = np.array([446000.0, 4636000.0])
 DENSITY = BuildOptions(
     segmentation=SegmentationOptions(segmenter="density")
@@ -29,16 +27,7 @@ CROSS = [[(0, 400), (400, 400)], [(400, 400), (800, 400)], [(400, 0), (400, 400)
 def drives(*paths, n=8, noise=1.0, seed=0):
     """A fleet that drives each path n times, with a lateral offset per drive; a fix every 15 m."""
     rng = np.random.default_rng(seed)
-    tables = []
-    for number in range(n * len(paths)):
-        path = np.array(paths[number % len(paths)], float)
-        along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-        at = np.arange(0, along[-1], 15.0)
-        x, y = (np.interp(at, along, path[:, axis]) + rng.normal(0, noise) for axis in (0, 1))
-        tables.append(
-            pd.DataFrame({"trace_id": number, "t": np.arange(len(at)), "x": x + ORIGIN[0], "y": y + ORIGIN[1]})
-        )
-    return fleet_from_tables(pd.concat(tables), crs=CRS, target_crs=CRS)
+    return fleet_of(*(ORIGIN + spaced(*path, spacing=15.0) + rng.normal(0, noise, 2) for path in paths * n))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +39,7 @@ def test_a_crossing_comes_out(crossing):
     graph = build(crossing, options=replace(DENSITY, refine=False))
     check_graph(graph)
     assert sorted(graph.degrees()) == [1, 1, 1, 1, 4]
-    reference = graph_from_lines([np.array(line) + ORIGIN for line in CROSS], crs=CRS)
+    reference = graph_of(*(np.array(line) + ORIGIN for line in CROSS))
     scores = evaluate(graph, reference, metrics=["geo"])
     assert scores["f1"].iloc[0] > 0.9
     assert graph.edges["score"].between(0.5, 1).all()
@@ -200,8 +189,7 @@ def test_a_finer_grid_gives_the_same_roads(crossing):
 
 
 def test_a_single_fix_makes_no_road():
-    table = pd.DataFrame({"trace_id": [1], "t": [0], "x": [446000.0], "y": [4636000.0]})
-    graph = build(fleet_from_tables(table, crs=CRS, target_crs=CRS), options=DENSITY)
+    graph = build(fleet_of([ORIGIN]), options=DENSITY)
     check_graph(graph)
     assert graph.edges.empty
 

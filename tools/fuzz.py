@@ -27,11 +27,13 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import reduce
 from multiprocessing.connection import Connection
+from operator import xor
 from pathlib import Path
 from typing import Any
 
-FLEET = ("csv", "parquet", "geoparquet", "gpx")
+FLEET = ("csv", "parquet", "geoparquet", "gpx", "nmea", "plt", "porto", "clocks", "records", "layer", "layer-gpkg")
 GRAPH = ("graph-parquet", "geojson", "gpkg", "fgb", "shp", "graphml", "osm", "pbf", "overpass", "lines", "osmnx")
 READERS = FLEET + GRAPH
 UTM = "EPSG:32632"
@@ -182,6 +184,8 @@ def write_seeds(folder: Path) -> dict[str, Path]:
     head = '<?xml version="1.0"?><gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1">'
     paths["gpx"].write_text(f"{head}<trk><name>a</name><trkseg>{fixes}</trkseg></trk></gpx>")
 
+    paths |= _write_other_fleets(at, drives, gpd.GeoDataFrame(drives, geometry=points, crs=4326))
+
     east, north = 500000.0, 5316000.0
     roads = [[(0, 0), (40, 3), (90, 0)], [(90, 0), (90, 70)], [(90, 0), (150, 1), (200, 0)]]
     lines = [shapely.LineString([(east + x, north + y, 400) for x, y in road]) for road in roads]
@@ -201,6 +205,36 @@ def write_seeds(folder: Path) -> dict[str, Path]:
     paths["osmnx"].write_text(OSMNX)
     paths["overpass"] = at["overpass"] / "roads.json"
     paths["overpass"].write_text(OVERPASS)
+    return paths
+
+
+def _write_other_fleets(at: dict[str, Path], drives: Any, layer: Any) -> dict[str, Path]:
+    """Write the drives as logs, lines, layers, and with times and degrees in words."""
+
+    def summed(body: str) -> str:
+        return f"${body}*{reduce(xor, body.encode()):02X}\n"
+
+    names = {"nmea": "drive.nmea", "plt": "drive.plt", "porto": "porto.csv", "clocks": "clocks.csv"}
+    names |= {"records": "fixes.json", "layer": "fixes.geojson", "layer-gpkg": "fixes.gpkg"}
+    paths = {reader: at[reader] / name for reader, name in names.items()}
+    paths["nmea"].write_text(
+        "".join(
+            summed(f"GPRMC,{row.t:%H%M%S}.00,A,4800.{row.Index:04d},N,00900.0000,E,9.0,90.0,010524,,,A")
+            + summed(f"GPGGA,{row.t:%H%M%S}.00,4800.{row.Index:04d},N,00900.0000,E,1,08,0.9,{row.z},M,46.9,M,,")
+            for row in drives.itertuples()
+        )
+    )
+    fixes = (f"{row.lat:.6f},{row.lon:.6f},0,492,45413.3,{row.t:%F,%T}\n" for row in drives.itertuples())
+    paths["plt"].write_text("Geolife trajectory\nWGS 84\nAltitude is in Feet\nReserved 3\n0\n0\n" + "".join(fixes))
+    line = str(drives[["lon", "lat"]].round(6).to_numpy().tolist())
+    rows = (f'"{number}","200","{1372636858 + number}","{line}"\n' for number in range(3))
+    paths["porto"].write_text('"TRIP_ID","TAXI_ID","TIMESTAMP","POLYLINE"\n' + "".join(rows))
+    worded = drives.assign(date=drives["t"].dt.strftime("%d.%m.%Y"), time=drives["t"].dt.strftime("%H:%M:%S"))
+    worded = worded.assign(lat=worded["lat"].astype(str) + "N", ew="E", **{"speed (km/h)": 32.4})
+    worded.drop(columns=["t", "speed"]).to_csv(paths["clocks"], index=False, sep=";", decimal=",")
+    drives.to_json(paths["records"], orient="records", date_format="iso")
+    for reader in ("layer", "layer-gpkg"):
+        layer.to_file(paths[reader])
     return paths
 
 

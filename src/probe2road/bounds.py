@@ -1,4 +1,4 @@
-"""What a value may be, said in its annotation: bounds for `typing.Annotated`, and the check of one value.
+"""Bounds of values for `typing.Annotated`, and the check of one value against them.
 
 The vocabulary is small on purpose. Four names cover most fields of options: `Positive` (above 0), `NotNegative` (0 or
 more), `Share` (0 to 1, both included) and `Probability` (0 to 1, none included). Bounds cover the others:
@@ -45,12 +45,12 @@ _LONGEST_VALUE = 60  # characters of a wrong value that a message shows
 
 @dataclass(frozen=True)
 class AtLeast:
-    """A bound: the number itself, or more."""
+    """A lower bound that is allowed itself."""
 
     limit: float
 
     def allows(self, value: Any) -> bool:
-        """Whether a value keeps the bound."""
+        """Tell whether a value is within the bound."""
         return value >= self.limit
 
     def __str__(self) -> str:
@@ -59,12 +59,12 @@ class AtLeast:
 
 @dataclass(frozen=True)
 class Above:
-    """A bound: more than the number."""
+    """A lower bound that is not allowed itself."""
 
     limit: float
 
     def allows(self, value: Any) -> bool:
-        """Whether a value keeps the bound."""
+        """Tell whether a value is within the bound."""
         return value > self.limit
 
     def __str__(self) -> str:
@@ -73,12 +73,12 @@ class Above:
 
 @dataclass(frozen=True)
 class AtMost:
-    """A bound: the number itself, or less."""
+    """An upper bound that is allowed itself."""
 
     limit: float
 
     def allows(self, value: Any) -> bool:
-        """Whether a value keeps the bound."""
+        """Tell whether a value is within the bound."""
         return value <= self.limit
 
     def __str__(self) -> str:
@@ -87,12 +87,12 @@ class AtMost:
 
 @dataclass(frozen=True)
 class Below:
-    """A bound: less than the number."""
+    """An upper bound that is not allowed itself."""
 
     limit: float
 
     def allows(self, value: Any) -> bool:
-        """Whether a value keeps the bound."""
+        """Tell whether a value is within the bound."""
         return value < self.limit
 
     def __str__(self) -> str:
@@ -100,13 +100,13 @@ class Below:
 
 
 class OneOf:
-    """A bound: one of some words, as ``OneOf("greedy", "optimal")``."""
+    """A bound: one of several words, as in ``OneOf("greedy", "optimal")``."""
 
     def __init__(self, *choices: str) -> None:
         self.choices = choices
 
     def allows(self, value: Any) -> bool:
-        """Whether a value is one of the words."""
+        """Tell whether a value is one of the words."""
         return value in self.choices
 
     def __str__(self) -> str:
@@ -115,10 +115,10 @@ class OneOf:
 
 @dataclass(frozen=True)
 class NotEmpty:
-    """A bound: a list with something in it."""
+    """A bound: a list with at least one element."""
 
     def allows(self, value: Any) -> bool:
-        """Whether there is something in a list."""
+        """Tell whether a list has at least one element."""
         return len(value) > 0
 
     def __str__(self) -> str:
@@ -132,7 +132,7 @@ Probability = Annotated[float, Above(0), Below(1)]  # neither impossible nor cer
 
 
 class MisfitError(Exception):
-    """A value that is not what an annotation wants."""
+    """A value does not fit its annotation."""
 
     def __init__(self, name: str, value: Any, hint: Any) -> None:
         text = repr(value)
@@ -142,7 +142,7 @@ class MisfitError(Exception):
 
 
 def fitted(value: Any, hint: Any, name: str) -> Any:
-    """Return a value as an annotation wants it.
+    """Return a value converted to its annotation, or raise MisfitError.
 
     A whole number becomes a float where one is wanted (never the reverse), a list becomes a tuple, text becomes a
     path, and numbers of NumPy become those of Python. A number is finite; ``True`` is none.
@@ -179,7 +179,7 @@ def fitted(value: Any, hint: Any, name: str) -> Any:
 
 
 def _converted(value: Any, kind: Any, name: str) -> Any:
-    """Return a value as an object of a type; MISSING where it is none, MisfitError where one of its entries is not."""
+    """Return a value as an object of a type; MISSING if it is none, MisfitError if one of its entries does not fit."""
     origin, arguments = get_origin(kind) or kind, get_args(kind)
     if origin in _UNIONS:
         for one in arguments:
@@ -206,7 +206,7 @@ def _converted(value: Any, kind: Any, name: str) -> Any:
 
 
 def _converted_list(value: Any, kinds: tuple[Any, ...], name: str) -> Any:
-    """Return a list as a tuple of types, of which the last may be an ellipsis."""
+    """Return a list as a tuple of types; the last type may be an ellipsis."""
     if not isinstance(value, tuple | list):
         return MISSING
     if kinds[-1] is Ellipsis:
@@ -217,7 +217,7 @@ def _converted_list(value: Any, kinds: tuple[Any, ...], name: str) -> Any:
 
 
 def _converted_number(value: Any, kind: type) -> Any:
-    """Return a number that is finite."""
+    """Return a value as a finite number."""
     if kind is int:
         return int(value) if isinstance(value, Integral) else MISSING
     if not isinstance(value, Real):
@@ -230,7 +230,7 @@ def _converted_number(value: Any, kind: type) -> Any:
 
 
 def _words(hint: Any) -> str:
-    """Say what an annotation allows."""
+    """Return in words what an annotation allows."""
     kind, bounds = _without_bounds(hint)
     origin, arguments = get_origin(kind) or kind, get_args(kind)
     limits = " and ".join(str(bound) for bound in bounds)
@@ -254,7 +254,7 @@ def _words(hint: Any) -> str:
 
 
 def _listed(words: Sequence[str]) -> str:
-    """Join words with commas, and the last one with or."""
+    """Join words with commas, and the last one with "or"."""
     return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
@@ -267,7 +267,7 @@ def _without_bounds(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def alternatives(hint: Any) -> tuple[Any, ...]:
-    """Return the types of a union, all without bounds; the type itself where it is no union."""
+    """Return the types of a union, all without bounds; for another type, the type itself."""
     kind = _without_bounds(hint)[0]
     kinds = get_args(kind) if get_origin(kind) in _UNIONS else (kind,)
     return tuple(_without_bounds(one)[0] for one in kinds)

@@ -1,4 +1,4 @@
-"""The local metric CRS of a run, and the gate that refuses degrees.
+"""The local metric CRS of a run, and the check that refuses degrees.
 
 Everything inside probe2road happens in one metric CRS, chosen once per run from the extent of the data, so
 that a metre is a metre to within a part per thousand wherever the fleet drives. Degrees exist only in files.
@@ -115,7 +115,7 @@ def local_crs(lon: ArrayLike, lat: ArrayLike) -> CRS:
 
 
 def require_metric(crs: CRS | None, *, where: object = None) -> CRS:
-    """Return the CRS if lengths in it are metres; refuse anything else.
+    """Return a CRS in metres; refuse any other CRS.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def require_metric(crs: CRS | None, *, where: object = None) -> CRS:
 
 
 def is_true_to_scale(crs: CRS, lon: ArrayLike, lat: ArrayLike, *, tolerance: float = _SCALE_TOLERANCE) -> bool:
-    """Say whether a metre of a projected CRS is a metre on the ground, by default to two per thousand, at positions.
+    """Tell whether a metre of a projected CRS is a metre on the ground at positions, by default to two per thousand.
 
     Two per thousand is what a UTM zone shows half a zone beside its edge. Web Mercator fails away from the
     equator, where its metre is short by the cosine of the latitude.
@@ -229,7 +229,7 @@ def working_crs(
 
 
 def same_crs(first: CRS, second: CRS) -> bool:
-    """Say whether coordinates in x, y order mean the same in both: axis order and heights do not count.
+    """Tell whether coordinates in x, y order mean the same in both CRS; axis order and heights are ignored.
 
     Examples
     --------
@@ -244,7 +244,7 @@ def same_crs(first: CRS, second: CRS) -> bool:
 def require_same_crs(
     first: CRS, second: CRS, *, where: str, what: tuple[str, str] = ("the traces are", "the graph is")
 ) -> None:
-    """Refuse data in two CRS.
+    """Refuse data in two different CRS.
 
     Parameters
     ----------
@@ -290,7 +290,7 @@ def transform(x: ArrayLike, y: ArrayLike, source: CRS, target: CRS) -> tuple[Any
 
 
 def extent_in_degrees(bounds: tuple[float, float, float, float], crs: CRS) -> str:
-    """Say in degrees where a box (left, bottom, right, top) lies, for a message.
+    """Return the position of a box (left, bottom, right, top) in degrees, as text for a message.
 
     Examples
     --------
@@ -303,7 +303,7 @@ def extent_in_degrees(bounds: tuple[float, float, float, float], crs: CRS) -> st
 
 
 def turn_headings(heading: ArrayLike, x: ArrayLike, y: ArrayLike, source: CRS, target: CRS) -> NDArray[np.float64]:
-    """Turn headings from the north of one CRS to that of another, which may be some degrees apart.
+    """Convert headings relative to the north of one CRS to that of another, which may differ by some degrees.
 
     Parameters
     ----------
@@ -349,19 +349,19 @@ def _degree_extent(lon: ArrayLike, lat: ArrayLike) -> tuple[float, float, float,
 
 
 def _wrap(lon: float) -> float:
-    """Bring a longitude into [-180, 180)."""
+    """Return a longitude wrapped to [-180, 180)."""
     return float((lon + 180.0) % 360.0 - 180.0)
 
 
 def _named_crs(proj: str, name: str) -> CRS:
-    """Build a WGS84 projected CRS in metres that carries a name (PROJ strings are anonymous)."""
+    """Return a WGS84 projected CRS in metres with a name (PROJ strings have none)."""
     definition = CRS.from_user_input(f"{proj} +datum=WGS84 +units=m +no_defs +type=crs").to_json_dict()
     definition["name"] = name
     return CRS.from_json_dict(definition)
 
 
 def crs_to_text(crs: CRS) -> str:
-    """Return the shortest text that `probe2road.crs.parse_crs` turns into an equal CRS.
+    """Return the shortest text from which `probe2road.crs.parse_crs` makes an equal CRS.
 
     Examples
     --------
@@ -375,7 +375,7 @@ def crs_to_text(crs: CRS) -> str:
 
 
 def crs_title(crs: CRS) -> str:
-    """Return what a CRS is called, for people; one without a name is described.
+    """Return the name of a CRS for people, or a description if it has no name.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The main job on built-in data: a simulated fleet drives a cloverleaf, and its roads come out."""
+"""The main job on built-in data: a simulated fleet drives a cloverleaf, and its roads are built and scored."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def demo_fleet(*, n_drives: int = 200, seed: int = 1) -> Fleet:
 
 
 def run_demo(folder: str | Path, *, progress: Progress | None = None) -> tuple[dict[Path, str], pd.DataFrame]:
-    """Write fleet data into a folder, build the road graph from it, and score that against the true roads.
+    """Write fleet data into a folder, build the road graph from it, and compare that with the true roads.
 
     Parameters
     ----------

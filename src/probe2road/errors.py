@@ -33,7 +33,7 @@ _MOST_LINES = 40
 
 
 def _shortened(text: str) -> str:
-    """Cut what is long out of the middle of lines, and lines out of the end: a list of names may have any length."""
+    """Shorten a text: cut long lines in the middle, and many lines at the end, because a list of names may be long."""
     lines = text.split("\n")
     if len(lines) > _MOST_LINES:
         lines = [*lines[:_MOST_LINES], f"  and {len(lines) - _MOST_LINES} more lines"]
@@ -78,7 +78,7 @@ class Probe2RoadError(Exception):
 
 
 class InputError(Probe2RoadError, ValueError):
-    """The user's data is bad.
+    """The user's data are wrong.
 
     Examples
     --------
@@ -92,7 +92,7 @@ class InputError(Probe2RoadError, ValueError):
 
     @classmethod
     def from_faults(cls, faults: Sequence[str], *, where: object = None) -> InputError:
-        """Build one error from the faults a validator collected (at least one)."""
+        """Build one error from the faults that a validator collected (at least one)."""
         if len(faults) == 1:
             return cls(faults[0], where=where)
         lines = "".join(f"\n  {number}. {fault}" for number, fault in enumerate(faults, start=1))
@@ -143,13 +143,13 @@ class MissingExtraError(Probe2RoadError, ImportError):
 
     @classmethod
     def for_extra(cls, extra: str, *, feature: str) -> MissingExtraError:
-        """Build the error that prints the exact install line of an extra."""
+        """Build the error that gives the exact install command of an extra."""
         return cls(f"{feature} needs an optional dependency", fix=f"install it with: pip install 'probe2road[{extra}]'")
 
 
 @contextmanager
 def needs_extra(extra: str, *, feature: str) -> Iterator[None]:
-    """Turn a missing package among the imports in the block into the error that says what to install.
+    """Replace an import error for a missing package in the block by the error that says what to install.
 
     For the top of a module that cannot work without an optional dependency. A package that is there but broken
     keeps its own error.

@@ -1,4 +1,4 @@
-"""How results show themselves in a notebook: as figures, never as tables that name drives."""
+"""The appearance of results in a notebook: figures, never tables that name drives."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["figures_table", "in_notebook"]
 
 
 def figures_table(heading: str, figures: Mapping[str, object]) -> str:
-    """Write figures as a small HTML table under a heading, for ``_repr_html_``.
+    """Return figures as a small HTML table under a heading, for ``_repr_html_``.
 
     Examples
     --------
@@ -24,7 +24,7 @@ def figures_table(heading: str, figures: Mapping[str, object]) -> str:
 
 
 def in_notebook() -> bool:
-    """Say whether the code runs in a notebook, which shows results by itself.
+    """Tell whether the code runs in a notebook, which shows results by itself.
 
     A terminal does not, one with IPython neither: only a kernel does.
     """

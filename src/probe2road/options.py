@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 def checked(kind: type[T]) -> type[T]:
-    """Let a dataclass check its fields against their annotations; stands below ``@dataclass(frozen=True)``.
+    """Make a dataclass check its fields against their annotations; to be placed below ``@dataclass(frozen=True)``.
 
     Checked are types, bounds and choices, also inside tuples, mappings and optional fields, as
     `probe2road.bounds.fitted` has it; what can be converted is. Nested options have to be an object of their class.
@@ -103,7 +103,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def options_from_table(table: Mapping[str, Any], kind: type[T], *, where: object = None) -> T:
-    """Build a dataclass from a table of some of its fields; the others have their defaults.
+    """Build a dataclass from a table of some of its fields; other fields have their defaults.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def options_from_table(table: Mapping[str, Any], kind: type[T], *, where: object
     kind
         The dataclass; it need not be `checked` to be checked here.
     where
-        What messages call the table; the name of the class where it is None.
+        What messages call the table; the name of the class if it is None.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def options_from_table(table: Mapping[str, Any], kind: type[T], *, where: object
 
 
 def changed_by(defaults: T, table: Mapping[str, Any], *, where: object = None) -> T:
-    """Return a dataclass with the fields that a table sets; nested tables change nested dataclasses.
+    """Return a dataclass with the fields in a table replaced; nested tables change nested dataclasses.
 
     Raises
     ------
@@ -150,7 +150,7 @@ def changed_by(defaults: T, table: Mapping[str, Any], *, where: object = None) -
 
 
 def _made(kind: Any, defaults: Mapping[str, Any], table: Mapping[str, Any], where: object) -> Any:
-    """Return an object of a dataclass: a table over defaults."""
+    """Return an object of a dataclass, from a table and defaults."""
     where, hints = where or kind.__name__, _field_hints(kind)
     values = dict(defaults)
     for name, value in table.items():
@@ -167,7 +167,7 @@ def _made(kind: Any, defaults: Mapping[str, Any], table: Mapping[str, Any], wher
 
 
 def _from_toml(value: Any, hint: Any, default: Any, where: str) -> Any:
-    """Turn tables into the dataclasses that a field wants; anything else is left to the checker."""
+    """Convert tables to the dataclasses of a field; other values are left to the check."""
     kinds = alternatives(hint)
     if isinstance(value, Mapping):
         if is_dataclass(default):
@@ -185,7 +185,7 @@ def _from_toml(value: Any, hint: Any, default: Any, where: str) -> Any:
 
 
 def _settled(kind: type, values: Mapping[str, Any], where: object) -> dict[str, Any]:
-    """Return the values as the fields of a dataclass want them; raises OptionError with all that do not fit."""
+    """Return the values converted to the fields of a dataclass; raise OptionError with all that do not fit."""
     settled, faults = {}, []
     for name, hint in _field_hints(kind).items():
         try:
@@ -202,11 +202,11 @@ def _settled(kind: type, values: Mapping[str, Any], where: object) -> dict[str, 
 
 @cache
 def _field_hints(kind: Any) -> dict[str, Any]:
-    """Return the annotations of the fields of a dataclass, bounds included."""
+    """Return the annotations of the fields of a dataclass, including bounds."""
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: hints[field.name] for field in fields(kind)}
 
 
 def _default(field: Field[Any]) -> Any:
-    """Return the default of a field; MISSING where it has none."""
+    """Return the default of a field; MISSING if it has none."""
     return field.default if field.default_factory is MISSING else field.default_factory()

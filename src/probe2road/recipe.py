@@ -1,4 +1,4 @@
-"""The recipe: fleet data in, road graph out."""
+"""The recipe: from fleet data to a road graph."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 @checked
 class BuildOptions:
-    """Everything that decides which graph comes out."""
+    """All options that determine the resulting graph."""
 
-    segmentation: SegmentationOptions = field(default_factory=SegmentationOptions)  # what decides the probability
+    segmentation: SegmentationOptions = field(default_factory=SegmentationOptions)  # what the probability depends on
     mask: MaskOptions = field(default_factory=MaskOptions)  # which probability makes a road
     thinning: Annotated[str, OneOf(*METHODS)] = "guo_hall"  # how the mask becomes lines of one pixel; or zhang_suen
     vectorize: VectorizeOptions = field(default_factory=VectorizeOptions)  # how pixels become lines
-    clean: CleanOptions = field(default_factory=CleanOptions)  # what counts as a flaw
+    clean: CleanOptions = field(default_factory=CleanOptions)  # which parts of the graph count as flaws
     refine: bool = True  # whether the traces fill gaps, split false junctions and are counted
-    refinement: RefineOptions = field(default_factory=RefineOptions)  # how they do
+    refinement: RefineOptions = field(default_factory=RefineOptions)  # how the traces do this
 
 
 def build(
@@ -55,24 +55,24 @@ def build(
 ) -> RoadGraph:
     """Build a road graph from fleet data.
 
-    Rasterises the fleet window by window, segments each into centreline probability, thresholds, thins to a
-    skeleton, traces it into a graph and cleans that; then matches the traces to the graph to fill its gaps, to
-    split its false junctions and to count what was driven. The result does not depend on the order of the
-    traces. Memory follows the area that was driven, not its bounding box.
+    The fleet is rasterised window by window, and each window is segmented into centreline probability. A threshold
+    gives a mask, which is thinned to a skeleton, traced into a graph, and cleaned. Then traces are matched to the graph
+    to fill its gaps, to split its false junctions and to count drives. The result does not depend on the order of the
+    traces. Memory grows with the driven area, not with its bounding box.
 
     Parameters
     ----------
     fleet
         From `probe2road.read_fleet`.
     options
-        The defaults where it is None.
+        None takes the defaults.
     workspace
-        Folder for what every stage makes (GeoTIFF and GeoPackage). A run on the same fleet with the same
-        options takes from it what an earlier run completed, down to single windows; one with other options behind
-        the segmentation takes the probability. Nothing is written where it is None.
-        `probe2road.run.workspace.resumable` gives one that goes when the work is done.
+        Folder for the results of all stages (GeoTIFF and GeoPackage); None stores nothing. A later run on the same
+        fleet with the same options reuses results of an earlier run, down to single windows; a run that differs only
+        in options of the stages after the segmentation reuses the probability.
+        `probe2road.run.workspace.resumable` gives a folder that is removed when the work is done.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------
@@ -82,9 +82,9 @@ def build(
     Raises
     ------
     InputError
-        If the fleet has no fixes, or the weights of the network are bad or look at what it does not have.
+        If the fleet has no fixes, or the weights of the network are damaged or need channels that the fleet lacks.
     OptionError
-        If an option makes no sense.
+        If an option has an invalid value.
     OutputError
         If the workspace cannot be written, is no workspace, or is held by another run.
 

@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 
 from probe2road.fleet.contract import Fleet, fleet_from_tables
+from sketches import UTM
 
-CRS = "EPSG:32616"
 ORIGIN = np.array([446_000.0, 4_636_000.0])
 MARKINGS, BOUNDARIES = (-3.6, 0.0, 3.6), (-5.6, 5.6)  # m to the left of the middle of a road with two lanes
 Drive = tuple[pd.DataFrame, pd.DataFrame]  # traces, points
@@ -57,7 +57,7 @@ def drive(
 def fleet_of(drives: Sequence[Drive]) -> Fleet:
     """One fleet of all drives."""
     traces, points = (pd.concat(tables, ignore_index=True) for tables in zip(*drives, strict=True))
-    return fleet_from_tables(traces, points if len(points) else None, crs=CRS)
+    return fleet_from_tables(traces, points if len(points) else None, crs=UTM)
 
 
 @dataclass(frozen=True)

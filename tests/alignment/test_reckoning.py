@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from probe2road.alignment.align import align
 from probe2road.alignment.reckoning import steadying
 from probe2road.fleet.contract import Fleet, fleet_from_tables
-
-CRS = "EPSG:32616"
+from sketches import UTM
 
 
 def city_drive(rng: np.random.Generator, *, stretch: float = 1.0, turned: float = 0.0) -> tuple[Fleet, NDArray[Any]]:
@@ -29,7 +28,7 @@ def city_drive(rng: np.random.Generator, *, stretch: float = 1.0, turned: float 
         | {"speed": speed * stretch, "heading": (90.0 - np.degrees(heading) + turned) % 360.0}
     )
     table[["x", "y"]] += rng.normal(0.0, 1.0, true.shape)
-    return fleet_from_tables(table, crs=CRS, target_crs=CRS), true
+    return fleet_from_tables(table, crs=UTM, keep_crs=True), true
 
 
 @pytest.fixture

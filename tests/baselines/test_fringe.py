@@ -5,11 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from probe2road.baselines.fringe import fringe_branches, trace_fringe
-
-
-def mask_of(*rows: str) -> NDArray[np.bool_]:
-    return np.array([[pixel == "#" for pixel in row] for row in rows])
-
+from sketches import mask_of
 
 CROSS = mask_of(
     "....#....",

@@ -3,7 +3,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label
@@ -14,19 +13,11 @@ from probe2road.baselines.volume import Pillars, count_voxels, dense_pillars, pi
 from probe2road.baselines.volume_graph import graph_from_volume, voxel_links
 from probe2road.baselines.volume_skeleton import thin_volume
 from probe2road.errors import OptionError
-from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.raster.grid import Grid
+from sketches import UTM, fleet_of
 
-CRS = "EPSG:32616"
 Volume = NDArray[np.bool_]
-
-
-def fleet_of(*drives: list[tuple[float, float, float]]) -> Fleet:
-    """One trip per list of positions in space, one each second."""
-    rows = [(trip, k, *place) for trip, drive in enumerate(drives) for k, place in enumerate(drive)]
-    table = pd.DataFrame(rows, columns=["trace_id", "t", "x", "y", "z"])
-    return fleet_from_tables(table, crs=CRS, target_crs=CRS)
 
 
 def straight(x0: float, y0: float, x1: float, y1: float, z: float = 10.0) -> list[tuple[float, float, float]]:
@@ -46,7 +37,7 @@ def volume_of(pillars: Pillars, shape: tuple[int, ...]) -> Volume:
 
 class TestCounts:
     def test_trace_counts_once_where_its_segments_meet_and_again_when_it_returns(self) -> None:
-        grid = Grid.from_bounds((900, 0, 910, 3), crs=CRS)
+        grid = Grid.from_bounds((900, 0, 910, 3), crs=UTM)
         there = [(902.5, 1.5, 1.0), (905.5, 1.5, 1.0), (908.5, 1.5, 1.0)]
         counts = count_voxels(fleet_of(there), grid, height=3.0)
         assert counts.count.tolist() == [1] * 7
@@ -54,7 +45,7 @@ class TestCounts:
         assert counts.count.tolist() == [2, 2, 2, 2, 2, 2, 1]
 
     def test_fixes_without_altitude_are_left_out_unless_all_are(self) -> None:
-        grid = Grid.from_bounds((900, 0, 910, 3), crs=CRS)
+        grid = Grid.from_bounds((900, 0, 910, 3), crs=UTM)
         some = fleet_of([(902.5, 1.5, 7.0), (904.5, 1.5, np.nan)])
         assert count_voxels(some, grid, height=3.0).key.tolist() == [grid.rowcol(902.5, 1.5)[0] * grid.cols + 2]
         none = fleet_of([(902.5, 1.5, np.nan), (904.5, 1.5, np.nan)])
@@ -66,13 +57,13 @@ class TestDensity:
     @pytest.mark.parametrize(("traces", "threshold", "found"), [(1, 0.95, True), (1, 1.05, False), (3, 2.9, True)])
     def test_density_of_traces_on_one_line_is_their_number(self, traces: int, threshold: float, found: bool) -> None:
         fleet = fleet_of(*[straight(900, 50, 1000, 50)] * traces)
-        counts = count_voxels(fleet, Grid.from_bounds(fleet.bounds, crs=CRS, margin=20), height=3.0)
+        counts = count_voxels(fleet, Grid.from_bounds(fleet.bounds, crs=UTM, margin=20), height=3.0)
         pillars = dense_pillars(counts, sigma=3.0, sigma_vertical=3.0, threshold=threshold)
         assert (len(pillars.row) > 0) == found
 
     def test_windows_leave_no_seam(self, monkeypatch: pytest.MonkeyPatch) -> None:
         fleet = fleet_of(straight(900, 20, 1060, 70, 5.0), straight(900, 60, 1060, 30, 14.0))
-        counts = count_voxels(fleet, Grid.from_bounds(fleet.bounds, crs=CRS, margin=20), height=3.0)
+        counts = count_voxels(fleet, Grid.from_bounds(fleet.bounds, crs=UTM, margin=20), height=3.0)
         whole = dense_pillars(counts, sigma=2.0, sigma_vertical=2.0, threshold=0.5)
         monkeypatch.setattr("probe2road.baselines.volume._WINDOW", 23)
         parts = dense_pillars(counts, sigma=2.0, sigma_vertical=2.0, threshold=0.5)
@@ -131,7 +122,7 @@ class TestThinning:
 
 
 class TestGraph:
-    grid = Grid.from_bounds((900, 0, 930, 30), crs=CRS)
+    grid = Grid.from_bounds((900, 0, 930, 30), crs=UTM)
 
     def test_step_across_a_cube_is_no_link_where_shorter_ones_lead(self) -> None:
         assert len(voxel_links(*np.array([[0, 0, 0], [1, 1, 1]]).T)[0]) == 1

@@ -25,7 +25,10 @@ FLEET = {
     "--no-header",
     "--invalid",
     "--max-accuracy",
-} | {"--max-speed"}
+    "--max-speed",
+    "--time-format",
+    "--interval",
+}
 GRAPH = {"--layer", "--graph-crs"}
 REFERENCE = {"--reference-layer", "--reference-crs"}
 
@@ -33,17 +36,17 @@ REFERENCE = {"--reference-layer", "--reference-crs"}
 @pytest.mark.parametrize(
     ("verb", "offered"),
     [
-        ("build", FLEET | {"--point-columns"}),
-        ("align", FLEET | {"--point-columns"}),
-        ("match", FLEET | GRAPH),
+        ("build", FLEET | {"--point-columns", "--layer"}),
+        ("align", FLEET | {"--point-columns", "--layer"}),
+        ("match", FLEET | GRAPH | {"--traces-layer"}),
         ("evaluate", GRAPH | REFERENCE),
         ("info", FLEET | {"--layer"}),
-        ("view", FLEET | GRAPH | REFERENCE | {"--point-columns"}),
+        ("view", FLEET | GRAPH | REFERENCE | {"--point-columns", "--traces-layer"}),
     ],
 )
 def test_every_verb_offers_what_it_reads(verb: str, offered: set[str]) -> None:
     flags = {flag for option in COMMANDS[verb].params for flag in option.opts}
-    assert flags & (FLEET | GRAPH | REFERENCE | {"--point-columns"}) == offered
+    assert flags & (FLEET | GRAPH | REFERENCE | {"--point-columns", "--traces-layer"}) == offered
     assert all(option.help for option in COMMANDS[verb].params)
 
 
@@ -157,3 +160,15 @@ def test_errors_name_the_flag_that_helps(folder, capsys, words, hint):
     code, _, err = call(capsys, *words)
     assert code == 2
     assert hint in err
+
+
+def test_the_layer_of_the_traces_beside_that_of_the_graph(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fixes = gpd.GeoDataFrame(
+        {"trip": 1, "time": range(30)}, geometry=[shapely.Point(446000 + 10 * t, 4636000) for t in range(30)], crs=32616
+    )
+    for layer in ("monday", "tuesday"):
+        fixes.to_file(folder / "week.gpkg", layer=layer)
+    words = ("match", "week.gpkg", "city.gpkg", "--layer", "streets", "-o", "m.parquet")
+    code, _, err = call(capsys, *words)
+    assert (code, "--traces-layer monday" in err) == (2, True)
+    assert call(capsys, *words, "--traces-layer", "tuesday")[0] == 0

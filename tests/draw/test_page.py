@@ -25,8 +25,8 @@ from probe2road.draw.page import _indexed_png, write_page
 from probe2road.errors import OptionError, OutputError
 from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from sketches import EAST, NORTH, UTM
 
-EAST, NORTH = 446000.0, 4636000.0
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
@@ -39,7 +39,7 @@ def graph() -> RoadGraph:
         [(EAST + 200, NORTH), (EAST + 200, NORTH + 150)],
     ]
     attributes = pd.DataFrame({"support": pd.array([12, None, 3], "Int64"), "score": [0.91234, 0.8, None]})
-    plain = graph_from_lines(lines, crs="EPSG:32616", attributes=attributes)
+    plain = graph_from_lines(lines, crs=UTM, attributes=attributes)
     return replace(plain, edges=plain.edges.set_axis(pd.Index([10, 11, 12], name="edge")))
 
 
@@ -56,7 +56,7 @@ def fleet() -> Fleet:
             "kind": ["lane_marking", "road_boundary"],
         }
     )
-    return fleet_from_tables(traces, points, crs="EPSG:32616", target_crs="EPSG:32616")
+    return fleet_from_tables(traces, points, crs=UTM, keep_crs=True)
 
 
 def embedded(page: str) -> dict[str, object]:

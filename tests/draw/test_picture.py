@@ -3,18 +3,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from matplotlib.image import imread
 from numpy.typing import NDArray
 
 from probe2road.draw.picture import Panel, draw_graph, write_filmstrip
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet.contract import fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.raster.grid import Grid
+from sketches import UTM, fleet_of, spaced
 
-UTM = "EPSG:32616"
 GRID = Grid.from_bounds((0.0, 0.0, 100.0, 60.0), crs=UTM)
 
 
@@ -65,8 +63,7 @@ def test_equal_pictures_are_equal_files(graph: RoadGraph, tmp_path: Path) -> Non
 
 
 def test_a_graph_is_drawn_over_traces_and_reference(graph: RoadGraph, tmp_path: Path) -> None:
-    table = pd.DataFrame({"trace_id": 1, "x": np.arange(5.0, 95.0, 5.0), "y": 20.0})
-    fleet = fleet_from_tables(table, crs=UTM, target_crs=UTM)
+    fleet = fleet_of(spaced((5, 20), (90, 20), spacing=5.0))
     reference = graph_from_lines([[(5, 50), (95, 50)]], crs=UTM, origin="reference")
     draw_graph(graph, tmp_path / "all.png", fleet=fleet, reference=reference)
     picture = imread(tmp_path / "all.png")[:, :, :3]

@@ -1,24 +1,19 @@
-import numpy as np
-import pandas as pd
 import pytest
 from matplotlib.image import imread
 
 from probe2road.draw.view import require_drawable, view
 from probe2road.errors import InputError, OptionError, OutputError
-from probe2road.fleet.contract import fleet_from_tables
-from probe2road.graph.roadgraph import empty_graph, graph_from_lines
-
-UTM = "EPSG:32616"
+from probe2road.graph.roadgraph import empty_graph
+from sketches import UTM, fleet_of, graph_of, spaced
 
 
 @pytest.fixture
 def graph():
-    return graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 50)]], crs=UTM)
+    return graph_of([(0, 0), (100, 0)], [(100, 0), (100, 50)])
 
 
 def test_the_suffix_decides_between_page_and_picture(graph, tmp_path):
-    traces = pd.DataFrame({"trace_id": 1, "t": range(10), "x": np.arange(0.0, 100, 10), "y": 0.0})
-    fleet = fleet_from_tables(traces, crs=UTM, keep_crs=True)
+    fleet = fleet_of(spaced((0, 0), (90, 0)))
     for name in ("roads.html", "roads.HTM"):
         view(graph, tmp_path / name, fleet=fleet, title="A & B", color_by="length")
         assert "<h1>A &amp; B</h1>" in (tmp_path / name).read_text()

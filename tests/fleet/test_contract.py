@@ -11,8 +11,7 @@ from pyproj import CRS
 
 from probe2road.errors import CRSError, InputError, OptionError
 from probe2road.fleet.contract import TraceGaps, fleet_from_tables, trace_breaks
-
-UTM = "EPSG:32616"
+from sketches import UTM
 
 
 def drives(**columns: object) -> pd.DataFrame:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,13 +17,8 @@ from probe2road.graph.clean import (
     drop_small_components,
     merge_degree_two_nodes,
 )
-from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
-
-UTM = "EPSG:32616"
-
-
-def graph_of(*lines: Sequence[tuple[float, ...]]) -> RoadGraph:
-    return graph_from_lines(list(lines), crs=UTM)
+from probe2road.graph.roadgraph import RoadGraph, empty_graph
+from sketches import UTM, graph_of
 
 
 def with_columns(graph: RoadGraph, **columns: object) -> RoadGraph:

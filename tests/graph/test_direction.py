@@ -17,18 +17,15 @@ from probe2road.graph.direction import (
     tagged_direction,
     told_direction,
 )
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import TURN_DTYPES
-
-CRS = "EPSG:32616"
+from sketches import graph_of
 
 
 @pytest.fixture
 def tee() -> RoadGraph:
     """Three streets that meet at node 1, the second with heights."""
-    return graph_from_lines(
-        [[(0, 0), (100, 0)], [(100, 0, 5), (180, 0, 6), (200, 0, 9)], [(100, 0), (100, 80)]], crs=CRS
-    )
+    return graph_of([(0, 0), (100, 0)], [(100, 0, 5), (180, 0, 6), (200, 0, 9)], [(100, 0), (100, 80)])
 
 
 @pytest.mark.parametrize(
@@ -150,7 +147,7 @@ def test_a_turned_edge_says_so_in_the_words_of_its_column(
 
 def test_a_loop_is_turned_too() -> None:
     ring = [(0, 0), (9, 0), (9, 9), (0, 0)]
-    graph = graph_from_lines([ring], crs=CRS)
+    graph = graph_of(ring)
     turned = in_driving_direction(graph.edges.assign(oneway="-1"))
     assert shapely.get_coordinates(turned.geometry).tolist() == [[*map(float, place)] for place in reversed(ring)]
 

@@ -11,15 +11,14 @@ import pytest
 import shapely
 
 from probe2road.graph.ends import line_ends
-from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
-
-UTM = "EPSG:32616"
+from probe2road.graph.roadgraph import RoadGraph, empty_graph
+from sketches import UTM, graph_of
 
 
 @pytest.fixture
 def bent() -> RoadGraph:
     """A road of 40 m that turns left after 30 m, and a loop of 40 m at its end."""
-    graph = graph_from_lines([[(0, 0), (30, 0), (30, 10)], [(30, 10), (40, 10), (40, 20), (30, 20), (30, 10)]], crs=UTM)
+    graph = graph_of([(0, 0), (30, 0), (30, 10)], [(30, 10), (40, 10), (40, 20), (30, 20), (30, 10)])
     return replace(
         graph, nodes=graph.nodes.set_axis([7, 3]), edges=graph.edges.replace({"u": {0: 7, 1: 3}, "v": {1: 3}})
     )

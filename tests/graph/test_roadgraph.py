@@ -11,8 +11,7 @@ from probe2road.errors import CRSError, InputError
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.graph.tables import TURN_DTYPES
-
-UTM = "EPSG:32616"
+from sketches import UTM
 
 
 @pytest.fixture

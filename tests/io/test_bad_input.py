@@ -15,8 +15,8 @@ import shapely
 
 from probe2road.errors import CRSError, InputError
 from probe2road.io.fleet_reader import read_fleet
+from sketches import UTM
 
-UTM = "EPSG:32616"
 GOOD = "trip,t,x,y\n1,0,446000,4636000\n1,1,446009,4636000\n"
 
 

@@ -12,8 +12,7 @@ from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import Fleet
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.formats import FleetFormat
-
-UTM = "EPSG:32616"
+from sketches import UTM
 
 
 def drive(n: int = 40, **columns: object) -> pd.DataFrame:
@@ -97,10 +96,10 @@ def test_headings_that_cannot_be_true(tmp_path: Path, caplog: pytest.LogCaptureF
 
 
 def test_an_optional_column_of_words_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    assert "speed" not in read(tmp_path, drive(Speed="23.5 kn")).traces
+    assert "speed" not in read(tmp_path, drive(Speed="23.5 or so")).traces
     assert "the column is left out" in caplog.text
     with pytest.raises(InputError, match=r'columns=\{"speed": ""\}'):
-        read(tmp_path, drive(Speed="23.5 kn"), columns={"speed": "Speed"})
+        read(tmp_path, drive(Speed="23.5 or so"), columns={"speed": "Speed"})
 
 
 def test_limits_of_accuracy_and_speed(tmp_path: Path) -> None:
@@ -213,3 +212,78 @@ def test_messages_are_some_lines(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         read(tmp_path, table)
     assert len(str(caught.value)) < 1500
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(3.6, "km/h"), (1.944, "knots"), (2.237, "mph")])
+def test_speeds_of_another_unit_are_told_by_the_movement(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, factor: float, unit: str
+) -> None:
+    noise = np.random.default_rng(0).normal(1.0, 0.05, 40)
+    speeds = read(tmp_path, drive(speed=10.0 * factor * noise)).traces["speed"]
+    assert speeds.median() == pytest.approx(10.0, rel=0.03)
+    assert f"taken as {unit}; say the unit in the name of the column" in caplog.text
+
+
+@pytest.mark.parametrize(("speed", "warned"), [(10.0, False), (15.0, False), (50.0, True), (2.8, True), (0.0, False)])
+def test_speeds_of_no_unit_stay_as_they_are(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, speed: float, warned: bool
+) -> None:
+    assert read(tmp_path, drive(speed=speed)).traces["speed"].tolist() == [speed] * 40
+    assert read(tmp_path, drive(10, speed=36.0)).traces["speed"].tolist() == [36.0] * 10  # too few to say
+    assert ("check their unit" in caplog.text) == warned
+
+
+ROWS = range(6)
+
+
+@pytest.mark.parametrize("number", ["id", "fid", "index", "Unnamed: 0", "objectid", "OBJECTID", "row", ""])
+@pytest.mark.parametrize(
+    "clock", ["created_at", "datetime", "gps_time", "recorded", "epoch_ms", "Time Stamp", "fixTime"]
+)
+def test_row_numbers_are_no_traces_and_clocks_are_found(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, number: str, clock: str
+) -> None:
+    times = [1714550400000 + 1000 * row if clock == "epoch_ms" else f"2024-05-01 08:00:0{row}" for row in ROWS]
+    lines = "".join(f"{row},{4 + row // 3},{times[row]},11.5{row},48.1\n" for row in ROWS)
+    traces = written(tmp_path, f"{number},taxi_id,{clock},lon,lat\n{lines}").traces
+    assert traces["trace_id"].tolist() == [4, 4, 4, 5, 5, 5]
+    assert traces["t"].dt.second.tolist() == list(ROWS)
+    assert "traces are told apart by 'taxi_id'" in caplog.text
+
+
+def test_a_vehicle_that_pauses_is_on_another_drive(tmp_path: Path) -> None:
+    hours = (8, 8, 9, 9)
+    lines = "".join(f"4,2024-05-01T0{hour}:00:0{row}Z,11.5{row},48.1\n" for row, hour in enumerate(hours))
+    assert written(tmp_path, f"taxi_id,tracked_at,lon,lat\n{lines}").traces["trace_id"].tolist() == [
+        *("4/0", "4/0", "4/1", "4/1")
+    ]
+
+
+def test_the_title_of_a_report_is_passed_over(tmp_path: Path) -> None:
+    title = "Report: Route\nDevice: Van 3\n\nPeriod: May 2024\n"
+    lines = "".join(f"2024-05-01 08:00:0{row},48.1,11.50{row},north\n" for row in ROWS)
+    table = f"{title}Time,Latitude,Longitude,z\n{lines}"
+    with pytest.raises(InputError, match=r"line 6: north"):
+        written(tmp_path, table, columns={"t": "Time", "z": "z"})
+    assert len(written(tmp_path, table.replace("north", "500"), header=True).traces) == 6
+
+
+@pytest.mark.parametrize(
+    ("line", "columns"),
+    [
+        ("37.75134 -122.39488 0 1213084687", '{"t": "3", "x": "1", "y": "0"}'),
+        (
+            "6a0c,9f8b,1475277482,104.04392,30.67518",
+            '{"vehicle_id": "0", "trace_id": "1", "t": "2", "x": "3", "y": "4"}',
+        ),
+    ],
+)
+def test_a_first_line_of_data_shows_the_columns(tmp_path: Path, line: str, columns: str) -> None:
+    with pytest.raises(InputError) as caught:
+        written(tmp_path, f"{line}\n{line}\n")
+    assert f'columns={columns} crs="EPSG:4326"' in str(caught.value)
+
+
+def test_rows_may_end_with_a_delimiter(tmp_path: Path) -> None:
+    lines = "".join(f"1,2024-05-01 08:00:0{row},48.1,11.50{row},\n" for row in ROWS)
+    assert len(written(tmp_path, f"trip,time,lat,lon\n{lines}").traces) == 6

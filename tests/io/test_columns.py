@@ -6,7 +6,8 @@ import pytest
 from pyproj import CRS
 
 from probe2road.errors import InputError, OptionError
-from probe2road.io.columns import KIND_SYNONYMS, USUAL_NAMES, choose_columns, standard_kinds, times_from_numbers
+from probe2road.io.clocks import times_from_numbers
+from probe2road.io.columns import KIND_SYNONYMS, USUAL_NAMES, choose_columns, standard_kinds
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ from probe2road.crs import WGS84, transform
 from probe2road.errors import OptionError
 from probe2road.fleet.contract import Fleet, fleet_from_tables, trace_breaks
 from probe2road.io.fleet_reader import read_fleet
+from sketches import UTM
 
-UTM = "EPSG:32616"
 DATA = Path(os.environ.get("PROBE2ROAD_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
 
 METRES = pd.DataFrame(

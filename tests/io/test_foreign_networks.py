@@ -26,7 +26,9 @@ def line(*places: tuple[float, ...]) -> shapely.LineString:
     return shapely.LineString([(EAST + x, NORTH + y, *z) for x, y, *z in places])
 
 
-def graph_of(path: Path, lines: list[shapely.LineString], crs: str = UTM, **columns: list[object]) -> RoadGraph:
+def graph_through_file(
+    path: Path, lines: list[shapely.LineString], crs: str = UTM, **columns: list[object]
+) -> RoadGraph:
     """Write lines to a GIS file and read them."""
     gpd.GeoDataFrame(columns, geometry=lines, crs=UTM).to_crs(crs).to_file(path)
     graph = read_graph(path)
@@ -38,7 +40,7 @@ def graph_of(path: Path, lines: list[shapely.LineString], crs: str = UTM, **colu
 def test_a_line_for_each_direction_is_one_edge(tmp_path: Path, name: str) -> None:
     street, lane = line((0, 0), (50, 4), (100, 0)), line((100, 0), (100, 80))
     crs = "EPSG:4326" if name.endswith("geojson") else UTM
-    graph = graph_of(tmp_path / name, [street, street.reverse(), lane, lane.reverse()], crs=crs)
+    graph = graph_through_file(tmp_path / name, [street, street.reverse(), lane, lane.reverse()], crs=crs)
     assert len(graph.edges) == 2
     assert sorted(graph.degrees()) == [1, 1, 2]
 
@@ -71,7 +73,9 @@ def test_a_line_that_is_there_twice_is_not_a_street_of_two_directions() -> None:
 def test_a_side_street_that_ends_on_an_inner_vertex_meets_the_road(tmp_path: Path) -> None:
     main, side = line((0, 0), (400, 0), (800, 0)), line((400, 0), (400, 300))
     over = line((200, -50), (200, 50))
-    graph = graph_of(tmp_path / "city.geojson", [main, side, over], "EPSG:4326", name=["main", "side", "over"])
+    graph = graph_through_file(
+        tmp_path / "city.geojson", [main, side, over], "EPSG:4326", name=["main", "side", "over"]
+    )
     assert graph.edges["name"].tolist() == ["main", "main", "side", "over"]
     assert sorted(graph.degrees()) == [1, 1, 1, 1, 1, 3]
     apart = read_graph(tmp_path / "city.geojson", inner_junctions=False)
@@ -96,13 +100,13 @@ def test_a_line_that_ends_on_itself_becomes_a_stem_and_a_loop() -> None:
 
 @pytest.mark.parametrize("crs", ["EPSG:3857", "EPSG:3395", "EPSG:6933"])
 def test_what_is_not_true_to_scale_is_projected(tmp_path: Path, crs: str) -> None:
-    graph = graph_of(tmp_path / "city.gpkg", [line((0, 0), (1000, 0)), line((0, 50), (0, 2050))], crs)
+    graph = graph_through_file(tmp_path / "city.gpkg", [line((0, 0), (1000, 0)), line((0, 50), (0, 2050))], crs)
     assert graph.crs.to_epsg() == 32632
     assert graph.length == pytest.approx(3000, abs=0.1)
 
 
 def test_a_crs_that_is_not_true_to_scale_cannot_be_asked_for(tmp_path: Path) -> None:
-    graph_of(tmp_path / "city.gpkg", [line((0, 0), (1000, 0))])
+    graph_through_file(tmp_path / "city.gpkg", [line((0, 0), (1000, 0))])
     with pytest.raises(CRSError, match=r"city\.gpkg: a metre of .* is no metre .* target_crs=.EPSG:32632"):
         read_graph(tmp_path / "city.gpkg", target_crs="EPSG:3857")
     assert working_crs(CRS.from_epsg(3857), [1e6], [6e6], own=True).to_epsg() == 3857

@@ -9,10 +9,10 @@ from pyproj import CRS
 
 import probe2road as p2r
 from probe2road.errors import CRSError, OptionError
-from probe2road.graph.roadgraph import graph_from_lines
 from probe2road.io.formats import FleetFormat, GraphFormat
 from probe2road.io.graph_writers import write_geopackage
 from probe2road.options import options_from_table, read_toml
+from sketches import graph_of
 
 ROWS = "7;0;446000;4636000\n7;1;446009;4636000\n8;0;446000;4636500\n"
 
@@ -91,7 +91,7 @@ def test_no_format_has_a_crs_that_is_none(kind: type, field: str) -> None:
 
 
 def test_a_graph_has_a_format_too(tmp_path: Path) -> None:
-    graph = graph_from_lines([[(446000, 4636000), (446100, 4636000)]], crs="EPSG:32616")
+    graph = graph_of([(446000, 4636000), (446100, 4636000)])
     write_geopackage(graph, tmp_path / "roads.gpkg")
     table = pyogrio.read_dataframe(tmp_path / "roads.gpkg", layer="edges")[["geometry"]]
     for layer in ("rivers", "streets"):

@@ -108,3 +108,30 @@ def test_gpx_is_like_the_same_table(tmp_path: Path) -> None:
     (tmp_path / "b.csv").write_text("lat,lon\n41.87,-87.65\n41.88,-87.65\n")
     gpx, text = read_fleet(tmp_path / "a.gpx"), read_fleet(tmp_path / "b.csv")
     pd.testing.assert_frame_equal(gpx.traces.drop(columns="trace_id"), text.traces.drop(columns="trace_id"))
+
+
+POINTS = "".join(f'<trkpt lat="48.{number}" lon="11.{number}"/>' for number in (5, 1, 9, 3))
+TIMED = "".join(
+    f'<trkpt lat="48.1" lon="11.{number}"><time>2024-05-01T08:00:0{number}Z</time></trkpt>' for number in (1, 2)
+)
+
+
+def downloaded(folder: Path, *segments: str, creator: str = "OpenStreetMap.org") -> Path:
+    head = f'<?xml version="1.0"?><gpx version="1.0" creator="{creator}" xmlns="http://www.topografix.com/GPX/1/0">'
+    body = "".join(f"<trk><trkseg>{segment}</trkseg></trk>" for segment in segments)
+    (folder / "points.gpx").write_text(f"{head}{body}</gpx>")
+    return folder / "points.gpx"
+
+
+def test_anonymous_points_are_no_drive(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(InputError, match="4 of 4 track points of the OpenStreetMap server are anonymous, no drive"):
+        read_fleet(downloaded(tmp_path, POINTS))
+    assert read_fleet(downloaded(tmp_path, POINTS, TIMED)).traces["trace_id"].unique().tolist() == ["points/1/0"]
+    assert "4 of 6 track points of the OpenStreetMap server are anonymous, no drive: left out" in caplog.text
+    with pytest.raises(InputError, match="are anonymous"):
+        read_fleet(tmp_path / "points.gpx", invalid="refuse")
+
+
+def test_other_points_without_time_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert len(read_fleet(downloaded(tmp_path, POINTS, creator="receiver")).traces) == 4
+    assert "4 of 4 track points have no time and count as driven in their order" in caplog.text

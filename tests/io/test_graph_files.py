@@ -21,8 +21,7 @@ from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.graph.tables import TURN_DTYPES
 from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.io.graph_readers import read_vector_graph
-
-EAST, NORTH = 446000.0, 4636000.0
+from sketches import EAST, NORTH, UTM
 
 
 @pytest.fixture
@@ -34,7 +33,7 @@ def tee() -> RoadGraph:
         [(EAST + 100, NORTH), (EAST + 100, NORTH + 80)],
     ]
     attributes = pd.DataFrame({"support": pd.array([7, 3, None], "Int64"), "score": [0.9, 0.8, None]})
-    graph = graph_from_lines(lines, crs="EPSG:32616", attributes=attributes)
+    graph = graph_from_lines(lines, crs=UTM, attributes=attributes)
     return replace(graph, turns=pd.DataFrame([(0, 1, 1, 4), (0, 1, 2, 2)], columns=list(TURN_DTYPES)))
 
 
@@ -145,7 +144,7 @@ def reference_lines(**columns: list[object]) -> gpd.GeoDataFrame:
         shapely.LineString([(EAST, NORTH), (EAST + 50, NORTH)]),
         shapely.LineString([(EAST + 50, NORTH), (EAST, NORTH + 50)]),
     ]
-    return gpd.GeoDataFrame({**columns}, geometry=lines, crs="EPSG:32616")
+    return gpd.GeoDataFrame({**columns}, geometry=lines, crs=UTM)
 
 
 @pytest.mark.parametrize("suffix", [".gpkg", ".fgb", ".shp", ".parquet"])
@@ -188,7 +187,7 @@ def test_a_file_without_crs_needs_one(tmp_path: Path) -> None:
         pyogrio.write_dataframe(table.set_crs(None, allow_override=True), tmp_path / "city.fgb")
     with pytest.raises(CRSError, match=r"city\.fgb: no CRS; say which one it is"):
         read_graph(tmp_path / "city.fgb")
-    assert read_graph(tmp_path / "city.fgb", crs="EPSG:32616").crs.to_epsg() == 32616
+    assert read_graph(tmp_path / "city.fgb", crs=UTM).crs.to_epsg() == 32616
     table.to_file(tmp_path / "known.fgb")
     with pytest.raises(CRSError, match="is in WGS 84 / UTM zone 16N, not in EPSG:2100"):
         read_graph(tmp_path / "known.fgb", crs="EPSG:2100")
@@ -214,14 +213,14 @@ def test_the_layer_is_named_where_there_are_several(tmp_path: Path) -> None:
 
 
 def test_points_are_not_roads(tmp_path: Path) -> None:
-    gpd.GeoDataFrame(geometry=[shapely.Point(EAST, NORTH)], crs="EPSG:32616").to_file(tmp_path / "stops.gpkg")
+    gpd.GeoDataFrame(geometry=[shapely.Point(EAST, NORTH)], crs=UTM).to_file(tmp_path / "stops.gpkg")
     with pytest.raises(InputError, match=r"stops\.gpkg: holds no lines \(Point\); give a file with road centrelines"):
         read_graph(tmp_path / "stops.gpkg")
 
 
 def test_siblings_of_another_graph_are_noticed(tee: RoadGraph, tmp_path: Path) -> None:
     write_graph(tee, tmp_path / "roads.parquet")
-    write_graph(graph_from_lines([[(0, 0), (1, 0)]], crs="EPSG:32616"), tmp_path / "other.parquet")
+    write_graph(graph_from_lines([[(0, 0), (1, 0)]], crs=UTM), tmp_path / "other.parquet")
     (tmp_path / "other.nodes.parquet").replace(tmp_path / "roads.nodes.parquet")
     with pytest.raises(InputError, match=r"roads\.nodes\.parquet, is of another graph; take both from one run"):
         read_graph(tmp_path / "roads.parquet")

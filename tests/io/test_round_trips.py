@@ -13,12 +13,10 @@ import shapely
 
 from probe2road.errors import CRSError, InputError, OptionError, OutputError
 from probe2road.graph.direction import driving_direction, in_driving_direction
-from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.io.graph_files import WRITABLE, read_graph, write_graph
 from probe2road.io.graph_networkx import from_networkx, to_networkx
-
-UTM = "EPSG:32616"
-EAST, NORTH = 446000.0, 4636000.0
+from sketches import EAST, NORTH, UTM, graph_of
 
 
 @pytest.fixture
@@ -29,7 +27,7 @@ def block() -> RoadGraph:
         [(EAST, NORTH), (EAST + 50, NORTH + 30), (EAST + 100, NORTH)],
         [(EAST + 100, NORTH), (EAST + 130, NORTH + 20), (EAST + 130, NORTH - 20), (EAST + 100, NORTH)],
     ]
-    graph = graph_from_lines(lines, crs=UTM)
+    graph = graph_of(*lines)
     counts = {"forward": [9, 0, 3], "backward": [8, 12, 0], "support": [17, 12, 3]}
     return replace(graph, edges=graph.edges.assign(**counts).astype(dict.fromkeys(counts, "Int64")))
 

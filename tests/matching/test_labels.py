@@ -8,26 +8,24 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import shapely
 from scipy import ndimage
 
 from probe2road.errors import CRSError, InputError, MissingExtraError, OptionError
-from probe2road.fleet.contract import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.matching import osrm as osrm_module
 from probe2road.matching.labels import LabelOptions, cut_reference, label
 from probe2road.matching.osrm import OsrmOptions, find_osrm, osrm_network, osrm_segments, osrm_server
+from probe2road.raster.drawing import label_mask
 from probe2road.raster.grid import Grid
-from probe2road.raster.lines import label_mask
 from probe2road.simulation.drawn.generate import generate_interchange
 from probe2road.simulation.fleet_simulation import simulate
-
-CRS = "EPSG:32616"
-EAST, NORTH = 446000.0, 4636000.0  # OSRM needs coordinates that exist
+from sketches import EAST, NORTH, UTM, fleet_of, graph_of, spaced
 
 
 def road(*corners: tuple[float, float]) -> list[tuple[float, float]]:
+    """Move a line to a place that exists, which OSRM asks for."""
     return [(EAST + x, NORTH + y) for x, y in corners]
 
 
@@ -36,18 +34,12 @@ TEE = [road((0, 0), (200, 0)), road((200, 0), (500, 0)), road((200, 0), (200, 90
 
 def fleet(*lines: list[tuple[float, float]], spacing: float = 10.0) -> Fleet:
     """Return one trace per line, with fixes at 10 m/s."""
-    tables = []
-    for name, corners in enumerate(lines):
-        line = shapely.LineString(corners)
-        xy = shapely.get_coordinates(shapely.line_interpolate_point(line, np.arange(1.0, line.length, spacing)))
-        times = pd.Timestamp("2024-01-01", tz="UTC") + pd.to_timedelta(np.arange(len(xy)) * spacing / 10.0, "s")
-        tables.append(pd.DataFrame({"trace_id": name, "t": times, "x": xy[:, 0], "y": xy[:, 1]}))
-    return fleet_from_tables(pd.concat(tables), crs=CRS, target_crs=CRS)
+    return fleet_of(*(spaced(*line, spacing=spacing, start=1.0) for line in lines), interval=spacing / 10.0)
 
 
 @pytest.fixture
 def tee() -> RoadGraph:
-    return graph_from_lines(TEE, crs=CRS)
+    return graph_of(*TEE)
 
 
 @pytest.fixture
@@ -93,7 +85,7 @@ def test_the_same_stretch_twice_is_not_half_a_piece(tee: RoadGraph) -> None:
 
 def test_pieces_are_between_half_and_whole() -> None:
     lengths = np.array([40.0, 100.0, 100.5, 260.0, 999.0])
-    graph = graph_from_lines([[(0, 50 * k), (length, 50 * k)] for k, length in enumerate(lengths)], crs=CRS)
+    graph = graph_of(*([(0, 50 * k), (length, 50 * k)] for k, length in enumerate(lengths)))
     cut = cut_reference(graph, max_piece=100.0)
     check_graph(cut)
     assert cut.edges.groupby("reference_edge")["length"].sum().tolist() == pytest.approx(lengths.tolist())
@@ -115,29 +107,27 @@ def test_own_labels_are_true_on_a_simulated_interchange() -> None:
 
 def test_mask_is_thin_and_connected() -> None:
     rng = np.random.default_rng(2)
-    graph = graph_from_lines([rng.uniform(0, 200, (5, 2))], crs=CRS)
-    grid = Grid.from_bounds(graph.bounds, crs=CRS)
+    graph = graph_of(rng.uniform(0, 200, (5, 2)))
+    grid = Grid.from_bounds(graph.bounds, crs=UTM)
     mask = label_mask(graph, grid)
     _, parts = ndimage.label(mask, np.ones((3, 3)))
     assert parts == 1
-    straight = label_mask(
-        graph_from_lines([[(0.5, 0.5), (90.5, 30.5)]], crs=CRS), Grid.from_bounds((0, 0, 99, 40), crs=CRS)
-    )
+    straight = label_mask(graph_of([(0.5, 0.5), (90.5, 30.5)]), Grid.from_bounds((0, 0, 99, 40), crs=UTM))
     assert straight.sum() == 91
     assert (straight.sum(axis=0) <= 1).all()
 
 
 def test_mask_does_not_depend_on_the_direction_of_edges_and_ends_at_the_grid() -> None:
     lines = [[(0.5, 0.5), (60.5, 37.5)], [(60.5, 37.5), (300.5, 10.5)]]
-    grid = Grid.from_bounds((0, 0, 100, 50), crs=CRS)
-    one, other = (label_mask(graph_from_lines(drawn, crs=CRS), grid) for drawn in (lines, [x[::-1] for x in lines]))
+    grid = Grid.from_bounds((0, 0, 100, 50), crs=UTM)
+    one, other = (label_mask(graph_of(*drawn), grid) for drawn in (lines, [x[::-1] for x in lines]))
     assert (one == other).all()
     assert one[:, -1].sum() == 1
 
 
 def test_wide_mask_is_the_thin_one_dilated() -> None:
-    graph = graph_from_lines([[(10.5, 10.5), (40.5, 22.5)]], crs=CRS)
-    grid = Grid.from_bounds((0, 0, 50, 40), crs=CRS)
+    graph = graph_of([(10.5, 10.5), (40.5, 22.5)])
+    grid = Grid.from_bounds((0, 0, 50, 40), crs=UTM)
     wide = ndimage.binary_dilation(label_mask(graph, grid), np.ones((3, 3)))
     assert (label_mask(graph, grid, width=3) == wide).all()
 
@@ -154,7 +144,7 @@ def test_bad_options_and_crs(tee: RoadGraph) -> None:
     with pytest.raises(CRSError):
         label_mask(tee, grid)
     with pytest.raises(OptionError, match="width"):
-        label_mask(tee, Grid.from_bounds(tee.bounds, crs=CRS), width=0)
+        label_mask(tee, Grid.from_bounds(tee.bounds, crs=UTM), width=0)
 
 
 def test_missing_osrm_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tee: RoadGraph) -> None:
@@ -169,9 +159,9 @@ def test_missing_osrm_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tee: R
 
 @pytest.mark.parametrize("matcher", ["own", "osrm"])
 def test_empty_reference_has_no_labels(matcher: str) -> None:
-    labels = label(empty_graph(CRS), fleet(road((0, 0), (200, 0))), options=LabelOptions(matcher=matcher))
+    labels = label(empty_graph(UTM), fleet(road((0, 0), (200, 0))), options=LabelOptions(matcher=matcher))
     assert labels.edges.empty
-    assert label_mask(labels, Grid.from_bounds((0, 0, 9, 9), crs=CRS)).sum() == 0
+    assert label_mask(labels, Grid.from_bounds((0, 0, 9, 9), crs=UTM)).sum() == 0
 
 
 def test_server_that_is_not_there(tee: RoadGraph) -> None:
@@ -211,7 +201,7 @@ def test_server_is_gone_afterwards(tee: RoadGraph, osrm: Path) -> None:
 
 
 def test_one_way_roads_are_closed_to_osrm(osrm: Path) -> None:
-    graph = graph_from_lines(TEE[:2], crs=CRS, attributes=pd.DataFrame({"oneway": ["yes", "yes"]}))
+    graph = graph_from_lines(TEE[:2], crs=UTM, attributes=pd.DataFrame({"oneway": ["yes", "yes"]}))
     against = fleet(*[road((500, 1), (0, 1))] * 4)
     options = LabelOptions(matcher="osrm", osrm_folder=osrm)
     closed = label(graph, against, options=options)

@@ -9,11 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import shapely
-from numpy.typing import NDArray
 
 from probe2road.crs import WGS84, local_crs, transform
 from probe2road.errors import CRSError, InputError, OptionError
-from probe2road.fleet.contract import Fleet, fleet_from_tables
+from probe2road.fleet.contract import fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.matching.match import Matches, MatchOptions, match, turn_counts
@@ -21,21 +20,7 @@ from probe2road.matching.models import PublishedModel, RouteModel
 from probe2road.matching.network import build_states
 from probe2road.matching.published import emission_table, transition
 from probe2road.options import options_from_table
-
-CRS = "EPSG:32616"
-
-
-def fleet(xy: NDArray[np.float64] | list[tuple[float, float]], *, interval: float = 1.0, **columns: object) -> Fleet:
-    places = np.asarray(xy, float)
-    table = pd.DataFrame(
-        {"trace_id": "a", "t": interval * np.arange(len(places)), "x": places[:, 0], "y": places[:, 1]}
-    )
-    return fleet_from_tables(table.assign(**columns), crs=CRS, target_crs=CRS)
-
-
-def along(*corners: tuple[float, float], spacing: float = 10.0) -> NDArray[np.float64]:
-    line = shapely.LineString(corners)
-    return shapely.get_coordinates(shapely.line_interpolate_point(line, np.arange(0.0, line.length + 0.1, spacing)))
+from sketches import UTM, fleet_of, graph_of, spaced
 
 
 def driven(found: Matches) -> list[tuple[int, bool]]:
@@ -58,8 +43,8 @@ CROSSING = [[(-200, 0), (0, 0)], [(0, 0), (200, 0)], [(0, -200), (0, 0)], [(0, 0
 def test_every_turn_of_a_crossing(
     profile: str, corners: list[tuple[float, float]], edges: list[tuple[int, bool]]
 ) -> None:
-    graph = graph_from_lines(CROSSING, crs=CRS)
-    found = match(graph, fleet(along(*corners) + 2.0), options=MatchOptions(profile=profile))
+    graph = graph_of(*CROSSING)
+    found = match(graph, fleet_of(spaced(*corners) + 2.0), options=MatchOptions(profile=profile))
     assert driven(found) == edges
     turns = turn_counts(found, graph)
     centre = int(graph.edges["v"].iloc[0])
@@ -68,8 +53,8 @@ def test_every_turn_of_a_crossing(
 
 
 def test_steps_say_where_a_traversal_begins_and_ends() -> None:
-    graph = graph_from_lines(CROSSING, crs=CRS)
-    found = match(graph, fleet(along((-190, 0), (190, 0))))
+    graph = graph_of(*CROSSING)
+    found = match(graph, fleet_of(spaced((-190, 0), (190, 0))))
     assert found.steps[["entered", "left"]].to_numpy().tolist() == [[False, True], [True, False]]
     assert found.steps["via_node"].isna().tolist() == [True, False]
     assert found.steps["t_first"].iloc[0] == found.fixes["t"].iloc[0]
@@ -83,9 +68,9 @@ def test_steps_say_where_a_traversal_begins_and_ends() -> None:
 
 
 def test_offsets_run_from_u_whichever_way_the_edge_is_driven() -> None:
-    graph = graph_from_lines([[(0, 0), (100, 0)]], crs=CRS)
+    graph = graph_of([(0, 0), (100, 0)])
     for xy in ([(20, 1), (50, 1), (80, 1)], [(80, 1), (50, 1), (20, 1)]):
-        found = match(graph, fleet(xy))
+        found = match(graph, fleet_of(xy))
         assert found.fixes["offset"].tolist() == [x for x, _ in xy]
         assert found.fixes["distance"].tolist() == [1.0, 1.0, 1.0]
         assert found.fixes["forward"].eq(xy[0][0] == 20).all()
@@ -93,25 +78,25 @@ def test_offsets_run_from_u_whichever_way_the_edge_is_driven() -> None:
 
 @pytest.mark.parametrize("side", [0.0, 12.0])
 def test_parallel_carriageways_are_told_apart(side: float) -> None:
-    graph = graph_from_lines([[(0, 0), (800, 0)], [(800, 12), (0, 12)]], crs=CRS)
+    graph = graph_of([(0, 0), (800, 0)], [(800, 12), (0, 12)])
     rng = np.random.default_rng(0)
-    xy = along((10, side), (790, side), spacing=15.0)
-    found = match(graph, fleet(xy + rng.normal(0, 2.0, xy.shape)))
+    xy = spaced((10, side), (790, side), spacing=15.0)
+    found = match(graph, fleet_of(xy + rng.normal(0, 2.0, xy.shape)))
     assert found.fixes["edge"].eq(0 if side == 0 else 1).all()
 
 
 def test_oneway_closes_the_other_way() -> None:
     lines = [[(0, 0), (400, 0)], [(0, 6), (400, 6)]]
-    graph = graph_from_lines(lines, crs=CRS, attributes=pd.DataFrame({"oneway": ["-1", "yes"]}))
-    xy = along((10, 2), (390, 2))
-    assert driven(match(graph, fleet(xy))) == [(1, True)]
-    assert driven(match(graph, fleet(xy), options=MatchOptions(respect_oneway=False))) == [(0, True)]
+    graph = graph_from_lines(lines, crs=UTM, attributes=pd.DataFrame({"oneway": ["-1", "yes"]}))
+    xy = spaced((10, 2), (390, 2))
+    assert driven(match(graph, fleet_of(xy))) == [(1, True)]
+    assert driven(match(graph, fleet_of(xy), options=MatchOptions(respect_oneway=False))) == [(0, True)]
 
 
 def test_the_heading_column_tells_a_standing_vehicle_from_the_cross_street() -> None:
-    graph = graph_from_lines(CROSSING, crs=CRS)
+    graph = graph_of(*CROSSING)
     for heading, edge in ((90.0, {0}), (0.0, {2})):
-        found = match(graph, fleet([(-2.0, -2.0)] * 3, heading=heading))
+        found = match(graph, fleet_of([(-2.0, -2.0)] * 3, heading=heading))
         assert set(found.fixes["edge"]) == edge
         assert found.fixes["forward"].all()
 
@@ -121,7 +106,7 @@ def stacked_roads() -> RoadGraph:
     x = np.array([0.0, 200, 400, 600, 1000])
     lower = np.stack([x, [30, 30, 0, 0, 0], [0, 0, 0, 0, 0]], axis=1)
     upper = np.stack([x, [-30, -30, -4, -4, -4], [0, 0, 7, 7, 7]], axis=1)
-    return graph_from_lines([lower, upper], crs=CRS)
+    return graph_of(lower, upper)
 
 
 @pytest.mark.parametrize("drift", [-9.0, 0.0, 9.0])
@@ -135,14 +120,14 @@ def test_altitude_tells_stacked_roads_apart_whatever_the_bias(height: float, dri
     # The roads are level and agree about the altitude before they meet: the bias is learnt there.
     places = np.concatenate([before, xy])
     z = np.concatenate([np.zeros(len(before)), np.full(len(x), height)]) + drift + rng.normal(0, 0.7, len(places))
-    found = match(graph, fleet(places, z=z))
+    found = match(graph, fleet_of(places, z=z))
     assert found.fixes["edge"].eq(0 if height == 0 else 1).mean() > 0.95
 
 
 def test_short_edges_between_fixes_are_on_the_path() -> None:
     x = [0.0, 50.0, 53.0, 54.0, 56.0, 60.0, 160.0]
-    graph = graph_from_lines([[(a, 0), (b, 0)] for a, b in pairwise(x)], crs=CRS)
-    found = match(graph, fleet(along((5, 1), (155, 1), spacing=25.0)))
+    graph = graph_of(*([(a, 0), (b, 0)] for a, b in pairwise(x)))
+    found = match(graph, fleet_of(spaced((5, 1), (155, 1), spacing=25.0)))
     assert [edge for edge, _ in driven(found)] == [0, 1, 2, 3, 4, 5]
     assert found.steps["t_first"].isna().tolist() == [False, True, True, False, True, False]
     assert turn_counts(found, graph)["count"].tolist() == [1] * 5
@@ -151,8 +136,10 @@ def test_short_edges_between_fixes_are_on_the_path() -> None:
 def test_loops_and_parallel_edges_are_distinguished() -> None:
     ring = [(100, 0), (150, 50), (200, 0), (150, -50), (100, 0)]
     lines = [[(0, 0), (100, 0)], ring, [(0, 0), (50, 40), (100, 0)]]
-    graph = graph_from_lines(lines, crs=CRS)
-    found = match(graph, fleet(along((5, 4), (50, 40), (100, 0), (150, 50), (200, 0), (150, -50), (100, 0), (10, 0))))
+    graph = graph_of(*lines)
+    found = match(
+        graph, fleet_of(spaced((5, 4), (50, 40), (100, 0), (150, 50), (200, 0), (150, -50), (100, 0), (10, 0)))
+    )
     assert driven(found) == [(2, True), (1, True), (0, False)]
     node = int(graph.edges["v"].iloc[0])
     assert turn_counts(found, graph).to_numpy().tolist() == [[1, node, 0, 1], [2, node, 1, 1]]
@@ -160,8 +147,8 @@ def test_loops_and_parallel_edges_are_distinguished() -> None:
 
 def test_weights_decide_between_equal_ways() -> None:
     lines = [[(-100, 0), (0, 0)], [(0, 0), (50, 3), (100, 0)], [(0, 0), (50, -3), (100, 0)], [(100, 0), (200, 0)]]
-    graph = graph_from_lines(lines, crs=CRS)
-    trace = fleet(along((-90, 0), (190, 0)))
+    graph = graph_of(*lines)
+    trace = fleet_of(spaced((-90, 0), (190, 0)))
     for dear in (1, 2):
         weights = pd.Series(1.0, index=graph.edges.index)
         weights[dear] = 0.1
@@ -171,8 +158,8 @@ def test_weights_decide_between_equal_ways() -> None:
 
 
 def test_a_stretch_off_the_network_parts_the_path() -> None:
-    graph = graph_from_lines([[(0, 0), (300, 0)], [(300, 0), (900, 0)]], crs=CRS)
-    found = match(graph, fleet(along((10, 0), (290, 0), (290, 300), (500, 300), (500, 0), (890, 0))))
+    graph = graph_of([(0, 0), (300, 0)], [(300, 0), (900, 0)])
+    found = match(graph, fleet_of(spaced((10, 0), (290, 0), (290, 300), (500, 300), (500, 0), (890, 0))))
     assert found.steps["part"].tolist() == [0, 1]
     assert found.steps["entered"].tolist() == [False, False]
     assert found.fixes["reason"].dropna().isin(["no edge within 60 m", "edges near, but none fits"]).all()
@@ -182,18 +169,18 @@ def test_a_stretch_off_the_network_parts_the_path() -> None:
 
 def test_a_fix_near_an_edge_that_it_does_not_drive_says_so() -> None:
     """A trace that runs along the edge, jumps 50 m off it, and back: near all the time, matched at both ends."""
-    places = along((10, 0), (590, 0))
+    places = spaced((10, 0), (590, 0))
     places[20:40, 1] = 59.0
-    found = match(graph_from_lines([[(0, 0), (600, 0)]], crs=CRS), fleet(places), options=MatchOptions(profile="fleet"))
+    found = match(graph_of([(0, 0), (600, 0)]), fleet_of(places), options=MatchOptions(profile="fleet"))
     missed = found.fixes["edge"].isna()
     assert missed.sum() >= 10
     assert found.fixes["reason"][missed].eq("edges near, but none fits").all()
 
 
 def test_a_trace_without_an_edge_near() -> None:
-    graph = graph_from_lines([[(0, 0), (100, 0)]], crs=CRS)
+    graph = graph_of([(0, 0), (100, 0)])
     for profile, words in (("fleet", "within 60 m"), ("sparse", "within 80 m"), ("published", "within 150 m")):
-        found = match(graph, fleet(along((0, 900), (100, 900))), options=MatchOptions(profile=profile))
+        found = match(graph, fleet_of(spaced((0, 900), (100, 900))), options=MatchOptions(profile=profile))
         assert found.fixes["edge"].isna().all()
         assert found.fixes["reason"].eq(f"no edge {words}").all()
         assert found.steps.empty
@@ -202,26 +189,26 @@ def test_a_trace_without_an_edge_near() -> None:
 
 @pytest.mark.parametrize("profile", ["auto", "published"])
 def test_an_empty_graph_matches_nothing(profile: str) -> None:
-    found = match(empty_graph(CRS), fleet([(0, 0), (9, 0)]), options=MatchOptions(profile=profile))
+    found = match(empty_graph(UTM), fleet_of([(0, 0), (9, 0)]), options=MatchOptions(profile=profile))
     assert found.fixes["reason"].tolist() == ["the graph has no edges"] * 2
     assert found.steps.empty
 
 
 @pytest.mark.parametrize("profile", ["auto", "sparse", "published"])
 def test_a_trace_of_one_fix(profile: str) -> None:
-    graph = graph_from_lines([[(0, 0), (100, 0)]], crs=CRS)
-    found = match(graph, fleet([(30, 5)]), options=MatchOptions(profile=profile))
+    graph = graph_of([(0, 0), (100, 0)])
+    found = match(graph, fleet_of([(30, 5)]), options=MatchOptions(profile=profile))
     assert found.fixes[["edge", "offset", "distance"]].to_numpy().tolist() == [[0, 30.0, 5.0]]
     assert driven(found) == [(0, True)]
 
 
 @pytest.mark.parametrize("profile", ["fleet", "sparse", "published"])
 def test_edges_without_length_are_passed(profile: str) -> None:
-    nodes = gpd.GeoDataFrame(geometry=shapely.points([(0, 0), (100, 0), (100, 0), (200, 0)]), crs=CRS)
+    nodes = gpd.GeoDataFrame(geometry=shapely.points([(0, 0), (100, 0), (100, 0), (200, 0)]), crs=UTM)
     lines = shapely.linestrings([[(0, 0), (100, 0)], [(100, 0), (100, 0)], [(100, 0), (200, 0)]])
-    edges = gpd.GeoDataFrame({"u": [0, 1, 2], "v": [1, 2, 3]}, geometry=lines, crs=CRS)
+    edges = gpd.GeoDataFrame({"u": [0, 1, 2], "v": [1, 2, 3]}, geometry=lines, crs=UTM)
     graph = RoadGraph(nodes, finish_edges(edges), empty_turns())
-    found = match(graph, fleet(along((5, 1), (195, 1), spacing=5.0)), options=MatchOptions(profile=profile))
+    found = match(graph, fleet_of(spaced((5, 1), (195, 1), spacing=5.0)), options=MatchOptions(profile=profile))
     edge = [edge for edge, _ in driven(found)]
     assert edge == [0, 1, 2] or profile == "published"  # which passes one state for each observation
     assert {edge[0], edge[-1]} == {0, 2}
@@ -229,43 +216,43 @@ def test_edges_without_length_are_passed(profile: str) -> None:
 
 def test_missing_altitudes_change_nothing() -> None:
     graph = stacked_roads()
-    xy = along((10, 30), (190, 30))
-    plain = match(graph, fleet(xy))
+    xy = spaced((10, 30), (190, 30))
+    plain = match(graph, fleet_of(xy))
     for z in (np.nan, np.where(np.arange(len(xy)) % 2, np.nan, 0.0)):
-        assert match(graph, fleet(xy, z=z)).fixes.equals(plain.fixes)
+        assert match(graph, fleet_of(xy, z=z)).fixes.equals(plain.fixes)
 
 
 def test_another_crs_is_refused() -> None:
     graph = graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32617")
     with pytest.raises(CRSError, match=r"the traces are in WGS 84 / UTM zone 16N, the graph is in .* 17N; reproject"):
-        match(graph, fleet([(0, 0), (9, 0)]))
+        match(graph, fleet_of([(0, 0), (9, 0)]))
 
 
 def test_turns_on_another_graph_are_refused() -> None:
-    graph = graph_from_lines(CROSSING, crs=CRS)
-    found = match(graph, fleet(along((-190, 0), (190, 0))))
+    graph = graph_of(*CROSSING)
+    found = match(graph, fleet_of(spaced((-190, 0), (190, 0))))
     with pytest.raises(InputError, match="edge 1 of the matches is not in the graph"):
-        turn_counts(found, graph_from_lines(CROSSING[:1], crs=CRS))
+        turn_counts(found, graph_of(*CROSSING[:1]))
 
 
 def test_auto_takes_the_profile_of_the_interval() -> None:
-    graph = graph_from_lines(CROSSING, crs=CRS)
-    xy = along((-190, 3), (190, 3), spacing=20.0)
+    graph = graph_of(*CROSSING)
+    xy = spaced((-190, 3), (190, 3), spacing=20.0)
     for interval, profile in ((4.0, "fleet"), (6.0, "sparse")):
-        trace = fleet(xy, interval=interval)
+        trace = fleet_of(xy, interval=interval)
         chosen = match(graph, trace, options=MatchOptions(profile=profile))
         assert match(graph, trace).fixes.equals(chosen.fixes)
 
 
 def test_traces_of_both_profiles_in_one_fleet_keep_their_order() -> None:
-    graph = graph_from_lines(CROSSING, crs=CRS)
+    graph = graph_of(*CROSSING)
     parts = []
     for number in range(6):
-        xy = along((-190, 3), (190, 3), spacing=20.0)
+        xy = spaced((-190, 3), (190, 3), spacing=20.0)
         step = 10.0 if number % 2 else 1.0
         parts.append(pd.DataFrame({"trace_id": number, "t": step * np.arange(len(xy)), "x": xy[:, 0], "y": xy[:, 1]}))
     table = pd.concat(parts, ignore_index=True)
-    found = match(graph, fleet_from_tables(table, crs=CRS, target_crs=CRS))
+    found = match(graph, fleet_from_tables(table, crs=UTM, keep_crs=True))
     assert found.fixes["trace_id"].tolist() == table["trace_id"].tolist()
     assert found.steps["trace_id"].tolist() == np.repeat(np.arange(6), 2).tolist()
     assert found.steps["position"].tolist() == [0, 1] * 6
@@ -288,7 +275,7 @@ def test_published_emission() -> None:
 
 def test_published_transitions() -> None:
     lines = [[(-9, 0), (0, 0)], [(0, 0), (9, 0)], [(0, 0), (0, 9)], [(9, 0), (19, 0)]]
-    states = build_states(graph_from_lines(lines, crs=CRS))
+    states = build_states(graph_of(*lines))
     weight = np.array([1.0, 1.0, 0.1, 1.0])
     onward = 1 - 0.5 - 1e-5
     assert transition(states, weight, 0, 0) == 0.5
@@ -329,22 +316,22 @@ def brute_force(states_xy: list[tuple[float, float]], graph: RoadGraph, model: P
 @pytest.mark.parametrize("seed", range(5))
 def test_published_equals_viterbi_over_full_matrices(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    graph = graph_from_lines([*CROSSING, [(0, 200), (200, 200)], [(200, 200), (200, 0)]], crs=CRS)
+    graph = graph_of(*CROSSING, [(0, 200), (200, 200)], [(200, 200), (200, 0)])
     corners = rng.choice(np.array([(-190, 0), (0, 0), (200, 0), (200, 200), (0, 190), (0, -190)]), 4, replace=False)
-    xy = along(*map(tuple, corners), spacing=9.0)
+    xy = spaced(*map(tuple, corners), spacing=9.0)
     xy = xy + np.cumsum(rng.normal(0, 3.0, xy.shape), axis=0)
     xy = xy[: 1 + int(np.argmax(np.append(np.hypot(*np.diff(xy, axis=0).T) > 10.0, True)))]  # no interpolated fixes
     model = PublishedModel(memory=1000)
-    found = match(graph, fleet(xy), options=MatchOptions(profile="published", published=model))
+    found = match(graph, fleet_of(xy), options=MatchOptions(profile="published", published=model))
     state = 2 * found.fixes["edge"] + (~found.fixes["forward"]).astype("Int64")
     assert state.fillna(-1).tolist() == brute_force([tuple(place) for place in xy], graph, model)
 
 
 def test_published_decides_with_bounded_memory() -> None:
-    graph = graph_from_lines(CROSSING, crs=CRS)
-    xy = along((-190, 4), (0, 4), (4, 190))
+    graph = graph_of(*CROSSING)
+    xy = spaced((-190, 4), (0, 4), (4, 190))
     long, short = (
-        match(graph, fleet(xy), options=MatchOptions(profile="published", published=PublishedModel(memory=memory)))
+        match(graph, fleet_of(xy), options=MatchOptions(profile="published", published=PublishedModel(memory=memory)))
         for memory in (300, 25)
     )
     assert driven(long) == driven(short) == [(0, True), (3, True)]
@@ -387,19 +374,19 @@ def test_a_real_track_follows_its_true_route(interval: int) -> None:
 
 
 def test_a_stray_fix_is_left_out_and_its_passage_stays_one() -> None:
-    graph = graph_from_lines([[(0, 0), (500, 0)]], crs="EPSG:32616")
+    graph = graph_of([(0, 0), (500, 0)])
     table = pd.DataFrame({"trace_id": 1, "t": [*range(10), 10.4, *range(12, 20)], "y": 1.0})
     table["x"] = 20.0 * table["t"]
-    straight = match(graph, fleet_from_tables(table.drop(index=10), crs="EPSG:32616", keep_crs=True))
+    straight = match(graph, fleet_from_tables(table.drop(index=10), crs=UTM, keep_crs=True))
     table.loc[10, "y"] = 320.0
-    found = match(graph, fleet_from_tables(table, crs="EPSG:32616", keep_crs=True))
+    found = match(graph, fleet_from_tables(table, crs=UTM, keep_crs=True))
     assert found.steps[["edge", "part"]].to_numpy().tolist() == [[0, 0]]
     assert found.fixes["reason"].dropna().to_dict() == {10: "could not have been driven to"}
     pd.testing.assert_frame_equal(found.fixes.drop(index=10).reset_index(drop=True), straight.fixes)
 
 
 def test_a_graph_elsewhere_is_told_with_both_extents(caplog: pytest.LogCaptureFixture) -> None:
-    graph = graph_from_lines([[(446000, 4636000), (446500, 4636000)]], crs="EPSG:32616")
+    graph = graph_of([(446000, 4636000), (446500, 4636000)])
     table = pd.DataFrame({"trace_id": 1, "t": range(9), "x": 446000.0 + 10 * np.arange(9), "y": 4736000.0})
-    match(graph, fleet_from_tables(table, crs="EPSG:32616"))
+    match(graph, fleet_from_tables(table, crs=UTM))
     assert "no fix of 9 is matched: the graph is at -87.65" in caplog.text

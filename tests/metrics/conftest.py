@@ -5,9 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
-
-CRS = "EPSG:32616"
+from probe2road.graph.roadgraph import RoadGraph
+from sketches import graph_of
 
 
 @pytest.fixture
@@ -24,6 +23,6 @@ def streets() -> Callable[..., RoadGraph]:
                     bend = (start + corner[end]) / 2 + rng.normal(0, noise, 2)
                     line = [start, bend, corner[end]]
                     lines.append(line if rng.random() < 0.5 else line[::-1])
-        return graph_from_lines(lines, crs=CRS)
+        return graph_of(*lines)
 
     return make

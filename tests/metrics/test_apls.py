@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import shapely
 
-from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.metrics import AplsOptions, apls, comparable
+from sketches import UTM, graph_of
 
-CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]
 
 
@@ -21,21 +21,21 @@ def test_identical_graphs_are_perfect(streets: Streets) -> None:
 
 def test_points_farther_than_the_snap_distance_score_zero() -> None:
     reference, proposal = ([[(0, y), (400, y)]] for y in (0.0, 5.0))
-    sides = graph_from_lines(proposal, crs=CRS), graph_from_lines(reference, crs=CRS)
+    sides = graph_of(*proposal), graph_of(*reference)
     assert apls(*sides).f1 == 0.0
     assert apls(*sides, options=AplsOptions(snap=6.0)).f1 == 1.0
 
 
 def test_a_detour_costs_its_relative_length() -> None:
-    reference = graph_from_lines([[(0, 0), (40, 0)]], crs=CRS)
-    proposal = graph_from_lines([[(0, 0), (20, 15), (40, 0)]], crs=CRS)
+    reference = graph_of([(0, 0), (40, 0)])
+    proposal = graph_of([(0, 0), (20, 15), (40, 0)])
     assert apls(proposal, reference).recall == pytest.approx(0.75)
 
 
 @pytest.mark.parametrize("empty_side", [0, 1])
 def test_an_empty_graph_scores_zero(empty_side: int, streets: Streets) -> None:
     sides = [streets(1), streets(1)]
-    sides[empty_side] = empty_graph(CRS)
+    sides[empty_side] = empty_graph(UTM)
     assert apls(*sides).f1 == 0.0
 
 

@@ -11,16 +11,12 @@ import shapely
 
 from probe2road.errors import InputError, OptionError
 from probe2road.graph.check import check_graph
-from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.metrics import METRICS, SCORE_DTYPES, GeoOptions, clip_graph, comparable, evaluate
 from probe2road.metrics.normalise import drop_twin_edges
+from sketches import UTM, graph_of
 
-CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]
-
-
-def graph(*lines: object) -> RoadGraph:
-    return graph_from_lines(list(lines), crs=CRS)
 
 
 def test_all_metrics_of_identical_graphs_are_one(streets: Streets) -> None:
@@ -41,10 +37,10 @@ def test_the_table_is_tidy_and_says_its_parameters(streets: Streets) -> None:
 @pytest.mark.parametrize("empty_side", [0, 1])
 def test_empty_graphs_score_zero_and_never_nan(empty_side: int, streets: Streets) -> None:
     sides = [streets(1), streets(1)]
-    sides[empty_side] = empty_graph(CRS)
+    sides[empty_side] = empty_graph(UTM)
     table = evaluate(*sides, metrics=list(METRICS))
     assert (table[["precision", "recall", "f1"]] == 0.0).all(axis=None)
-    both = evaluate(empty_graph(CRS), empty_graph(CRS), metrics=list(METRICS))
+    both = evaluate(empty_graph(UTM), empty_graph(UTM), metrics=list(METRICS))
     assert (both[["precision", "recall", "f1"]] == 0.0).all(axis=None)
 
 
@@ -70,13 +66,13 @@ def test_unknown_metrics_are_refused(streets: Streets) -> None:
 
 
 def test_merging_and_twins() -> None:
-    cut = graph([(0, 0), (50, 0)], [(50, 0), (0, 0)], [(50, 0), (90, 0)], [(90, 0), (90, 30)])
+    cut = graph_of([(0, 0), (50, 0)], [(50, 0), (0, 0)], [(50, 0), (90, 0)], [(90, 0), (90, 30)])
     merged, _ = comparable(cut, cut)
     assert merged.edges["length"].tolist() == [120.0]
 
 
 def test_stacked_roads_are_no_twins() -> None:
-    road = graph([(0, 0), (50, 0)])
+    road = graph_of([(0, 0), (50, 0)])
     nodes = pd.concat([road.nodes, road.nodes.set_index(road.nodes.index + 2)]).rename_axis("node")
     upper = road.edges.assign(u=2, v=3).set_index(road.edges.index + 1)
     stacked = RoadGraph(nodes, pd.concat([road.edges, upper]), road.turns)
@@ -85,7 +81,7 @@ def test_stacked_roads_are_no_twins() -> None:
 
 
 def test_clipping_cuts_a_road_that_leaves_and_returns() -> None:
-    road = graph([(0, 0), (100, 0), (100, 40), (0, 40)], [(0, 0), (0, 40)])
+    road = graph_of([(0, 0), (100, 0), (100, 40), (0, 40)], [(0, 0), (0, 40)])
     clipped = clip_graph(road, (-10, -10, 60, 60))
     check_graph(clipped)
     assert clipped.edges["length"].tolist() == [40.0, 60.0, 60.0]
@@ -93,7 +89,7 @@ def test_clipping_cuts_a_road_that_leaves_and_returns() -> None:
 
 
 def test_clipping_keeps_crossings_without_a_node_apart() -> None:
-    crossing = graph([(-50, 0), (50, 0)], [(0, -50), (0, 50)])
+    crossing = graph_of([(-50, 0), (50, 0)], [(0, -50), (0, 50)])
     clipped = clip_graph(crossing, (-20, -20, 20, 20))
     check_graph(clipped)
     assert clipped.edges["length"].tolist() == [40.0, 40.0]
@@ -102,13 +98,13 @@ def test_clipping_keeps_crossings_without_a_node_apart() -> None:
 def test_a_ramp_that_crosses_itself_is_cut_at_the_border_only() -> None:
     angle = np.linspace(0.0, 2.5 * np.pi, 400)
     spiral = np.column_stack([(30 + angle) * np.cos(angle), (30 - angle) * np.sin(angle)])
-    clipped = clip_graph(graph(spiral), (-100, -20, 100, 100))
+    clipped = clip_graph(graph_of(spiral), (-100, -20, 100, 100))
     check_graph(clipped)
     assert len(clipped.edges) == 2
 
 
 def test_heights_are_interpolated_where_a_road_is_cut() -> None:
-    clipped = clip_graph(graph([(0, 0, 0), (100, 0, 10)]), (25, -10, 75, 10))
+    clipped = clip_graph(graph_of([(0, 0, 0), (100, 0, 10)]), (25, -10, 75, 10))
     assert shapely.get_coordinates(clipped.edges.geometry.iloc[0], include_z=True)[:, 2].tolist() == [2.5, 7.5]
 
 
@@ -124,7 +120,7 @@ def test_clipped_length_equals_an_intersection(seed: int, streets: Streets) -> N
 def test_an_area_far_away_leaves_nothing(streets: Streets) -> None:
     clipped = clip_graph(streets(1), (1e6, 1e6, 2e6, 2e6))
     assert (len(clipped.nodes), len(clipped.edges)) == (0, 0)
-    assert len(clip_graph(empty_graph(CRS), (0, 0, 1, 1)).edges) == 0
+    assert len(clip_graph(empty_graph(UTM), (0, 0, 1, 1)).edges) == 0
 
 
 def test_an_empty_area_is_refused(streets: Streets) -> None:

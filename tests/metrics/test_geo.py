@@ -10,25 +10,21 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from probe2road.errors import CRSError, OptionError
-from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.metrics import HE_BALAKRISHNAN_2022, GeoOptions, comparable, geo, scores_table
 from probe2road.metrics.geo import geo_networks, geo_samples
 from probe2road.metrics.matching import Matching, match_one_to_one
 from probe2road.metrics.network import network_from_graph
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import sample_edges
+from sketches import UTM, graph_of
 
-CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]
-
-
-def graph(*lines: object) -> RoadGraph:
-    return graph_from_lines(list(lines), crs=CRS)
 
 
 def quarter_circle(radius: float) -> RoadGraph:
     angle = np.linspace(0.0, np.pi / 2, 20_001)
-    return graph(radius * np.column_stack([np.cos(angle), np.sin(angle)]))
+    return graph_of(radius * np.column_stack([np.cos(angle), np.sin(angle)]))
 
 
 def counts(proposal: RoadGraph, reference: RoadGraph, options: GeoOptions | None = None) -> tuple[int, int, int]:
@@ -49,33 +45,33 @@ def counts(proposal: RoadGraph, reference: RoadGraph, options: GeoOptions | None
     ],
 )
 def test_sampling_of_a_straight_line(length: float, spacing: float, expected: list[float]) -> None:
-    samples = sample_edges(network_from_graph(graph([(0, 0), (length, 0)])), spacing)
+    samples = sample_edges(network_from_graph(graph_of([(0, 0), (length, 0)])), spacing)
     assert samples.xy[:, 0].tolist() == expected
 
 
 def test_sampling_goes_round_corners_and_keeps_no_vertices() -> None:
-    samples = sample_edges(network_from_graph(graph([(0, 0), (4.5, 0), (4.5, 4.5)])), 3.0)
+    samples = sample_edges(network_from_graph(graph_of([(0, 0), (4.5, 0), (4.5, 4.5)])), 3.0)
     assert samples.xy.tolist() == [[0, 0], [3, 0], [4.5, 1.5], [4.5, 4.5]]
 
 
 def test_a_shared_node_is_sampled_once() -> None:
-    samples = sample_edges(network_from_graph(graph([(0, 0), (5, 0)], [(0, 0), (0, 5)], [(0, 0), (-5, 0)])), 11.0)
+    samples = sample_edges(network_from_graph(graph_of([(0, 0), (5, 0)], [(0, 0), (0, 5)], [(0, 0), (-5, 0)])), 11.0)
     assert samples.xy.tolist() == [[0, 0], [5, 0], [0, 5], [-5, 0]]
 
 
 def test_noise_in_the_length_makes_no_sample() -> None:
     far = 4_600_000.1  # m; coordinates as large as this carry noise of a nanometre
-    samples = sample_edges(network_from_graph(graph([(far, far), (far + 33.0 + 1e-9, far)])), 11.0)
+    samples = sample_edges(network_from_graph(graph_of([(far, far), (far + 33.0 + 1e-9, far)])), 11.0)
     assert len(samples.edge) == 4
 
 
 def test_identical_lines_are_perfect() -> None:
-    score = geo(graph([(0, 0), (100, 40)]), graph([(0, 0), (100, 40)]))
+    score = geo(graph_of([(0, 0), (100, 40)]), graph_of([(0, 0), (100, 40)]))
     assert (score.precision, score.recall, score.f1) == (1.0, 1.0, 1.0)
 
 
 def test_worked_example_of_a_line_half_as_long() -> None:
-    score = geo(graph([(0, 0), (6, 0)]), graph([(0, 0), (6, 0), (12, 0)]))
+    score = geo(graph_of([(0, 0), (6, 0)]), graph_of([(0, 0), (6, 0), (12, 0)]))
     assert (score.precision, score.recall, score.f1) == pytest.approx((1.0, 2 / 3, 0.8))
 
 
@@ -87,50 +83,50 @@ def test_concentric_quarter_circles(radius: float, expected: tuple[int, int, int
 
 
 def test_the_radius_is_inclusive() -> None:
-    reference = graph([(0, 0), (100, 0)])
-    assert geo(graph([(0, 6), (100, 6)]), reference).f1 == 1.0
-    assert geo(graph([(0, 6.001), (100, 6.001)]), reference).f1 == 0.0
+    reference = graph_of([(0, 0), (100, 0)])
+    assert geo(graph_of([(0, 6), (100, 6)]), reference).f1 == 1.0
+    assert geo(graph_of([(0, 6.001), (100, 6.001)]), reference).f1 == 0.0
 
 
 def test_duplicates_cost_precision_only() -> None:
-    score = geo(graph([(0, 0), (100, 0)], [(0, 2), (100, 2)]), graph([(0, 1), (100, 1)]))
+    score = geo(graph_of([(0, 0), (100, 0)], [(0, 2), (100, 2)]), graph_of([(0, 1), (100, 1)]))
     assert (score.precision, score.recall) == (0.5, 1.0)
 
 
 def test_roads_along_and_across_are_told_apart_on_request() -> None:
-    proposal, reference = graph([(0, -5), (0, 5)]), graph([(-5, 0), (5, 0)])
+    proposal, reference = graph_of([(0, -5), (0, 5)]), graph_of([(-5, 0), (5, 0)])
     assert geo(proposal, reference, options=GeoOptions(radius=8.0)).f1 == 1.0
     assert geo(proposal, reference, options=GeoOptions(radius=8.0, max_angle=60.0)).f1 == 0.0
 
 
 def test_scores_do_not_depend_on_how_edges_are_cut() -> None:
-    whole = graph([(0, 0), (100, 0)])
-    cut = graph([(0, 0), (31, 0)], [(77, 0), (31, 0)], [(77, 0), (100, 0)])
+    whole = graph_of([(0, 0), (100, 0)])
+    cut = graph_of([(0, 0), (31, 0)], [(77, 0), (31, 0)], [(77, 0), (100, 0)])
     assert counts(cut, whole) == counts(whole, whole) == (11, 11, 11)
 
 
 @pytest.mark.parametrize("empty_side", ["proposal", "reference", "both"])
 def test_an_empty_graph_scores_zero(empty_side: str) -> None:
-    road, nothing = graph([(0, 0), (100, 0)]), empty_graph(CRS)
+    road, nothing = graph_of([(0, 0), (100, 0)]), empty_graph(UTM)
     score = geo(*{"proposal": (nothing, road), "reference": (road, nothing), "both": (nothing, nothing)}[empty_side])
     assert (score.precision, score.recall, score.f1) == (0.0, 0.0, 0.0)
 
 
 def test_the_proposal_is_reprojected_to_the_reference() -> None:
-    reference = graph([(440_000, 4_635_000), (440_900, 4_635_300)])
+    reference = graph_of([(440_000, 4_635_000), (440_900, 4_635_300)])
     assert geo(reference.to_crs("EPSG:32615"), reference).f1 == 1.0
 
 
 def test_degrees_are_refused() -> None:
-    road = graph([(440_000, 4_635_000), (440_900, 4_635_300)])
+    road = graph_of([(440_000, 4_635_000), (440_900, 4_635_300)])
     degrees = RoadGraph(road.nodes.to_crs(4326), road.edges.to_crs(4326), road.turns)
     with pytest.raises(CRSError, match="reference: coordinates are in degrees"):
         geo(road, degrees)
 
 
 def test_phases_even_out_an_offset_that_is_all_or_nothing() -> None:
-    reference = graph([(0, 0), (5000, 0)])
-    lucky, unlucky = graph([(0, 4.0), (5000, 4.0)]), graph([(-5.5, 4.0), (4994.5, 4.0)])
+    reference = graph_of([(0, 0), (5000, 0)])
+    lucky, unlucky = graph_of([(0, 4.0), (5000, 4.0)]), graph_of([(-5.5, 4.0), (4994.5, 4.0)])
     assert geo(lucky, reference).precision == 1.0
     assert geo(unlucky, reference).precision < 0.01
     smooth = [geo(proposal, reference, options=GeoOptions(phases=11)).precision for proposal in (lucky, unlucky)]
@@ -166,13 +162,13 @@ def test_optimal_matching_equals_an_assignment(seed: int, streets: Streets) -> N
 
 
 def test_the_variant_of_he_and_balakrishnan() -> None:
-    reference = graph([(0, 0), (100, 0)])
-    assert geo(graph([(0, 0.9), (100, 0.9)]), reference, options=HE_BALAKRISHNAN_2022).f1 == 1.0
-    assert geo(graph([(0, 1.1), (100, 1.1)]), reference, options=HE_BALAKRISHNAN_2022).f1 == 0.0
+    reference = graph_of([(0, 0), (100, 0)])
+    assert geo(graph_of([(0, 0.9), (100, 0.9)]), reference, options=HE_BALAKRISHNAN_2022).f1 == 1.0
+    assert geo(graph_of([(0, 1.1), (100, 1.1)]), reference, options=HE_BALAKRISHNAN_2022).f1 == 0.0
 
 
 def test_parameters_stand_in_the_row() -> None:
-    row = scores_table([geo(graph([(0, 0), (100, 0)]), graph([(0, 0), (100, 0)]))]).iloc[0]
+    row = scores_table([geo(graph_of([(0, 0), (100, 0)]), graph_of([(0, 0), (100, 0)]))]).iloc[0]
     assert json.loads(row["parameters"]) == {
         "spacing": 11.0,
         "radius": 6.0,
@@ -200,8 +196,8 @@ def test_samples_add_up_to_the_counts(seed: int, matching: Matching, streets: St
 
 
 def test_samples_say_where_a_road_is_missing() -> None:
-    reference = graph([(0, 0), (22, 0)], [(0, 0), (0, 22)])
-    samples = geo_samples(*comparable_networks(graph([(0, 0), (22, 0)]), reference), GeoOptions())
+    reference = graph_of([(0, 0), (22, 0)], [(0, 0), (0, 22)])
+    samples = geo_samples(*comparable_networks(graph_of([(0, 0), (22, 0)]), reference), GeoOptions())
     assert samples.proposal_matched.all()
     missed = samples.reference_xy[~samples.reference_matched]
     assert sorted(missed.tolist()) == [[0.0, 11.0], [0.0, 22.0]]
@@ -210,7 +206,7 @@ def test_samples_say_where_a_road_is_missing() -> None:
 @pytest.mark.parametrize("empty_side", [0, 1])
 def test_an_empty_network_has_no_samples(empty_side: int, streets: Streets) -> None:
     sides = [streets(1), streets(1)]
-    sides[empty_side] = empty_graph(CRS)
+    sides[empty_side] = empty_graph(UTM)
     samples = geo_samples(*comparable_networks(*sides), GeoOptions())
     assert not samples.proposal_matched.any()
     assert not samples.reference_matched.any()

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import shapely
 
-from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.metrics import ItopoOptions, comparable, itopo
 from probe2road.metrics.itopo import itopo_pairs, project_nodes
 from probe2road.metrics.matching import candidate_pairs, match_one_to_one
 from probe2road.metrics.network import Network, network_from_graph
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.sampling import Centres, sample_around
+from sketches import UTM, graph_of
 
-CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]
 ARM = 200.0  # m
 EAST, NORTH, WEST, SOUTH = (ARM, 0.0), (0.0, ARM), (-ARM, 0.0), (0.0, -ARM)
@@ -25,7 +25,7 @@ EAST, NORTH, WEST, SOUTH = (ARM, 0.0), (0.0, ARM), (-ARM, 0.0), (0.0, -ARM)
 
 def star(*tips: tuple[float, float], centre: tuple[float, float] = (0.0, 0.0)) -> RoadGraph:
     """Straight arms of 200 m that meet in a centre."""
-    return graph_from_lines([[centre, (centre[0] + x, centre[1] + y)] for x, y in tips], crs=CRS)
+    return graph_of(*([centre, (centre[0] + x, centre[1] + y)] for x, y in tips))
 
 
 def centre_pair(
@@ -90,10 +90,10 @@ def test_micro_macro_and_strict_of_one_false_crossing() -> None:
 def test_more_nodes_raise_recall_but_not_strictly() -> None:
     """The known flaw of the metric: stubs on a road that is right make up for a crossing that is missed."""
     reference = star(EAST, NORTH, WEST, SOUTH)
-    plain = graph_from_lines([[WEST, EAST]], crs=CRS)
+    plain = graph_of([WEST, EAST])
     stubs = [[(x, 0.0), (x, 1.0)] for x in (-150.0, -100.0, 100.0, 150.0)]
     road = [[(a, 0.0), (b, 0.0)] for a, b in pairwise((-ARM, -150.0, -100.0, 100.0, 150.0, ARM))]
-    stubby = graph_from_lines([*road, *stubs], crs=CRS)
+    stubby = graph_of(*road, *stubs)
     assert itopo(stubby, reference).recall > itopo(plain, reference).recall
     strict = ItopoOptions(strict=True)
     assert itopo(stubby, reference, options=strict).recall == pytest.approx(
@@ -104,7 +104,7 @@ def test_more_nodes_raise_recall_but_not_strictly() -> None:
 def test_the_end_of_an_edge_that_is_closed_in_is_where_its_branches_meet() -> None:
     """A ring of 40 m at the end of a road: two branches meet 20 m round it."""
     ring = [(0, 0), (10, 0), (10, 10), (0, 10), (0, 0)]
-    network = network_from_graph(graph_from_lines([[(-100, 0), (0, 0)], ring], crs=CRS))
+    network = network_from_graph(graph_of([(-100, 0), (0, 0)], ring))
     node = np.array([1])
     samples = sample_around(network, Centres.from_nodes(node), radius=30.0, spacing=11.0)
     assert sorted(map(tuple, samples.xy.tolist())) == [
@@ -114,7 +114,7 @@ def test_the_end_of_an_edge_that_is_closed_in_is_where_its_branches_meet() -> No
 
 def test_a_branch_goes_on_through_further_junctions() -> None:
     lines = [[(0, 0), (8, 0)], [(8, 0), (8, 50)], [(8, 0), (50, 0)], [(0, 0), (-50, 0)], [(0, 0), (0, 5)]]
-    network = network_from_graph(graph_from_lines(lines, crs=CRS))
+    network = network_from_graph(graph_of(*lines))
     samples = sample_around(network, Centres.from_nodes(np.array([0])), radius=30.0, spacing=11.0)
     assert sorted(map(tuple, samples.xy.round(9).tolist())) == [
         (-30, 0), (-22, 0), (-11, 0), (0, 0), (0, 5), (8, 3), (8, 14), (8, 22), (11, 0), (22, 0), (30, 0),
@@ -123,7 +123,7 @@ def test_a_branch_goes_on_through_further_junctions() -> None:
 
 def test_stacked_roads_are_told_apart_by_direction() -> None:
     """A road's end above another road: both lie at no distance, and the lower number is the wrong one."""
-    other = graph_from_lines([[(0, -ARM), (0, ARM)], [(-ARM, 0), (ARM, 0)]], crs=CRS)
+    other = graph_of([(0, -ARM), (0, ARM)], [(-ARM, 0), (ARM, 0)])
     networks = [network_from_graph(side) for side in (star(EAST), other)]
     edge, offset = project_nodes(networks[0], np.array([0]), networks[1], ItopoOptions())
     assert (edge.tolist(), offset.tolist()) == ([1], [ARM])
@@ -132,11 +132,11 @@ def test_stacked_roads_are_told_apart_by_direction() -> None:
 @pytest.mark.parametrize("empty_side", [0, 1])
 def test_an_empty_graph_scores_zero(empty_side: int) -> None:
     sides = [star(EAST, WEST), star(EAST, WEST)]
-    sides[empty_side] = empty_graph(CRS)
+    sides[empty_side] = empty_graph(UTM)
     score = itopo(*sides)
     assert (score.precision, score.recall, score.f1) == (0.0, 0.0, 0.0)
     assert [score.reference, score.proposal][empty_side] == 8
-    assert itopo(empty_graph(CRS), empty_graph(CRS)).f1 == 0.0
+    assert itopo(empty_graph(UTM), empty_graph(UTM)).f1 == 0.0
 
 
 def fine_graph(network: Network, step: float) -> tuple[nx.Graph, dict[tuple[int, int], np.ndarray]]:

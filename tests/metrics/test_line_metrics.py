@@ -15,26 +15,22 @@ from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
 from probe2road.metrics import BufferGeoOptions, GraphSamplingOptions, buffer_geo, comparable, graph_sampling
 from probe2road.metrics.network import network_from_graph
 from probe2road.metrics.sampling import Centres, sample_around
+from sketches import UTM, graph_of
 
-CRS = "EPSG:32616"
 DATA = Path(os.environ.get("PROBE2ROAD_DATA", Path(__file__).parents[3] / "shared" / "data")) / "traces"
 Streets = Callable[..., RoadGraph]
 
 
-def graph(*lines: object) -> RoadGraph:
-    return graph_from_lines(list(lines), crs=CRS)
-
-
 def test_duplicates_are_free_in_buffer_geo_and_dear_in_graph_sampling() -> None:
-    reference = graph([(0, 0), (500, 0)])
-    double = graph([(0, 2), (500, 2)], [(0, -2), (500, -2)])
+    reference = graph_of([(0, 0), (500, 0)])
+    double = graph_of([(0, 2), (500, 2)], [(0, -2), (500, -2)])
     assert buffer_geo(double, reference)[0].f1 == 1.0
     score = graph_sampling(double, reference)[0]
     assert (score.precision, score.recall) == (0.5, 1.0)
 
 
 def test_a_segment_drawn_both_ways_counts_once() -> None:
-    both_ways = graph([(0, 0), (100, 0), (100, 50)], [(100, 0), (0, 0)])
+    both_ways = graph_of([(0, 0), (100, 0), (100, 50)], [(100, 0), (0, 0)])
     assert buffer_geo(both_ways, both_ways)[0].proposal == pytest.approx(150.0)
 
 
@@ -52,7 +48,7 @@ def test_buffer_geo_equals_buffered_geometry(seed: int, streets: Streets) -> Non
 
 def test_every_component_is_explored_from_one_root() -> None:
     """Samples every 5 m of network distance: 0, 5, 10 from (0, 0) and from (100, 0)."""
-    sides = graph([(0, 0), (6, 0)], [(6, 0), (6, 7)], [(100, 0), (112, 0)])
+    sides = graph_of([(0, 0), (6, 0)], [(6, 0), (6, 7)], [(100, 0), (112, 0)])
     [score] = graph_sampling(sides, sides, options=GraphSamplingOptions(radii=(5.0,)))
     assert (score.proposal, score.f1) == (6, 1.0)
 
@@ -68,7 +64,7 @@ def test_exploration_covers_all_edges(seed: int, streets: Streets) -> None:
 
 @pytest.mark.parametrize("metric", [buffer_geo, graph_sampling])
 def test_empty_graphs_score_zero(metric: Callable[..., list]) -> None:
-    road, nothing = graph([(0, 0), (100, 0)]), empty_graph(CRS)
+    road, nothing = graph_of([(0, 0), (100, 0)]), empty_graph(UTM)
     for sides in ((road, nothing), (nothing, road), (nothing, nothing)):
         assert all((s.precision, s.recall, s.f1) == (0.0, 0.0, 0.0) for s in metric(*sides))
 

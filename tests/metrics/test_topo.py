@@ -6,18 +6,14 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.metrics import TopoOptions, topo
 from probe2road.metrics.network import network_from_graph
 from probe2road.metrics.sampling import Centres, sample_around
 from probe2road.metrics.topo import _matched_marbles
+from sketches import UTM, graph_of
 
-CRS = "EPSG:32616"
 Streets = Callable[..., RoadGraph]
-
-
-def graph(*lines: object) -> RoadGraph:
-    return graph_from_lines(list(lines), crs=CRS)
 
 
 def test_identical_graphs_are_perfect(streets: Streets) -> None:
@@ -27,8 +23,8 @@ def test_identical_graphs_are_perfect(streets: Streets) -> None:
 
 
 def test_a_small_gap_cuts_what_lies_behind_it() -> None:
-    reference = graph([(0, 0), (1000, 0)])
-    whole, cut = graph([(0, 1), (1000, 1)]), graph([(0, 1), (495, 1)], [(505, 1), (1000, 1)])
+    reference = graph_of([(0, 0), (1000, 0)])
+    whole, cut = graph_of([(0, 1), (1000, 1)]), graph_of([(0, 1), (495, 1)], [(505, 1), (1000, 1)])
     assert topo(whole, reference).f1 > 0.99
     assert topo(cut, reference).precision > 0.99
     assert 0.7 < topo(cut, reference).recall < 0.9
@@ -36,28 +32,28 @@ def test_a_small_gap_cuts_what_lies_behind_it() -> None:
 
 def test_starts_without_a_partner_lower_recall_only() -> None:
     """The proposal lacks a whole component: 21 of 42 starts have no partner."""
-    reference = graph([(0, 0), (1000, 0)], [(0, 500), (1000, 500)])
-    score = topo(graph([(0, 0), (1000, 0)]), reference)
+    reference = graph_of([(0, 0), (1000, 0)], [(0, 500), (1000, 500)])
+    score = topo(graph_of([(0, 0), (1000, 0)]), reference)
     assert (score.precision, score.recall) == pytest.approx((1.0, 0.5))
     assert (score.details["starts"], score.details["matched_starts"]) == (42, 21)
 
 
 def test_a_partner_runs_along_the_road() -> None:
     """The crossing road is nearer than the parallel one, but is no partner."""
-    reference = graph([(0, 0), (300, 0)])
-    proposal = graph([(150, -40), (150, 40)], [(0, 9), (300, 9)])
+    reference = graph_of([(0, 0), (300, 0)])
+    proposal = graph_of([(150, -40), (150, 40)], [(0, 9), (300, 9)])
     assert topo(proposal, reference).details["matched_starts"] == 7
 
 
 def test_the_margin_leaves_out_starts_at_the_border() -> None:
-    road = graph([(0, 0), (1000, 0)])
+    road = graph_of([(0, 0), (1000, 0)])
     assert topo(road, road, options=TopoOptions(margin=0.07)).details["starts"] == 17
 
 
 @pytest.mark.parametrize("empty_side", [0, 1])
 def test_an_empty_graph_scores_zero(empty_side: int) -> None:
-    sides = [graph([(0, 0), (1000, 0)]), graph([(0, 0), (1000, 0)])]
-    sides[empty_side] = empty_graph(CRS)
+    sides = [graph_of([(0, 0), (1000, 0)]), graph_of([(0, 0), (1000, 0)])]
+    sides[empty_side] = empty_graph(UTM)
     score = topo(*sides)
     assert (score.precision, score.recall, score.f1) == (0.0, 0.0, 0.0)
 

@@ -12,8 +12,7 @@ from probe2road.fleet.contract import fleet_from_tables, trace_breaks
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import write_fleet
 from probe2road.io.wkb import point_coordinates
-
-UTM = "EPSG:32616"
+from sketches import UTM
 
 ids = st.text("abc0/ -é", min_size=1, max_size=4)
 
@@ -36,8 +35,8 @@ def tables(draw: st.DrawFn) -> pd.DataFrame:
 def test_row_order_does_not_matter(table: pd.DataFrame, random: object) -> None:
     order = list(range(len(table)))
     random.shuffle(order)  # type: ignore[attr-defined]
-    expected = fleet_from_tables(table, crs=UTM, target_crs=UTM)
-    shuffled = fleet_from_tables(table.iloc[order], crs=UTM, target_crs=UTM)
+    expected = fleet_from_tables(table, crs=UTM, keep_crs=True)
+    shuffled = fleet_from_tables(table.iloc[order], crs=UTM, keep_crs=True)
     pd.testing.assert_frame_equal(shuffled.traces, expected.traces)
 
 
@@ -70,10 +69,10 @@ def test_text_and_parquet_give_the_same_fleet(table: pd.DataFrame) -> None:
 @settings(max_examples=25, deadline=None)
 @given(tables())
 def test_every_trace_starts_with_a_break_and_moving_everything_changes_none(table: pd.DataFrame) -> None:
-    fleet = fleet_from_tables(table, crs=UTM, target_crs=UTM)
+    fleet = fleet_from_tables(table, crs=UTM, keep_crs=True)
     breaks = trace_breaks(fleet)
     assert breaks[fleet.starts[:-1]].all()
-    moved = fleet_from_tables(table.assign(x=table["x"] + 512, y=table["y"] - 1024), crs=UTM, target_crs=UTM)
+    moved = fleet_from_tables(table.assign(x=table["x"] + 512, y=table["y"] - 1024), crs=UTM, keep_crs=True)
     np.testing.assert_array_equal(trace_breaks(moved), breaks)
 
 

@@ -1,16 +1,14 @@
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from probe2road.fleet.contract import Fleet, fleet_from_tables
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.match import Matches, MatchOptions, match
+from sketches import fleet_of, graph_of
 
-CRS = "EPSG:32616"
 seeds = st.integers(0, 2**32 - 1)
 profiles = st.sampled_from(["fleet", "sparse"])
 
@@ -28,7 +26,7 @@ def random_streets(rng: np.random.Generator) -> RoadGraph:
                     middle = (corners[i, j] + corners[k, m]) / 2 + rng.uniform(-8.0, 8.0, 2)
                     line = np.array([corners[i, j], middle, corners[k, m]])
                     lines.append(line if rng.random() < 0.5 else line[::-1])
-    return graph_from_lines(lines, crs=CRS)
+    return graph_of(*lines)
 
 
 def random_drive(graph: RoadGraph, rng: np.random.Generator, n_edges: int) -> list[tuple[int, bool]]:
@@ -56,14 +54,6 @@ def positions(graph: RoadGraph, drive: list[tuple[int, bool]], spacing: float) -
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     at = np.arange(20.0, along[-1] - 20.0, spacing)
     return np.stack([np.interp(at, along, line[:, axis]) for axis in range(2)], axis=1)
-
-
-def fleet_of(places: dict[str, NDArray[np.float64]], interval: float = 1.0) -> Fleet:
-    tables = [
-        pd.DataFrame({"trace_id": name, "t": interval * np.arange(len(xy)), "x": xy[:, 0], "y": xy[:, 1]})
-        for name, xy in places.items()
-    ]
-    return fleet_from_tables(pd.concat(tables, ignore_index=True), crs=CRS, target_crs=CRS)
 
 
 def driven(found: Matches, trace: str = "a") -> list[tuple[int, bool]]:

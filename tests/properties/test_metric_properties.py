@@ -11,10 +11,9 @@ import shapely.affinity
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.metrics import GeoOptions, evaluate, geo, itopo, junctions, lateral
+from sketches import graph_of
 
-CRS = "EPSG:32616"
 CHEAP = ["geo", "itopo", "buffer_geo", "graph_sampling"]
 
 
@@ -32,17 +31,13 @@ def street_lines(draw: st.DrawFn) -> list[list[tuple[float, float]]]:
     return lines or [[(0.0, 0.0), (20.0, 5.0), (40.0, 0.0)]]
 
 
-def graph(lines: list[Any]) -> RoadGraph:
-    return graph_from_lines(lines, crs=CRS)
-
-
 @settings(max_examples=15, deadline=None)
 @given(street_lines())
 @example([[(0.0, 0.0), (0.0, 20.0), (0.0, 40.0)], [(0.0, 0.0), (0.0, 40.0), (0.0, 80.0)]])  # one upon the other
 @example([[(0.0, 0.0), (0.0, 60.0), (0.0, 120.0)], [(0.0, 40.0), (0.0, 60.0), (0.0, 80.0)]])  # one within the other
 @example([[(40.0, 0.0), (40.0, 60.0), (40.0, 120.0)], [(40.0, 40.0), (40.0, 61.25909373815464), (40.0, 80.0)]])
 def test_a_graph_against_itself_scores_one(lines: list[Any]) -> None:
-    table = evaluate(graph(lines), graph(lines), metrics=CHEAP)
+    table = evaluate(graph_of(*lines), graph_of(*lines), metrics=CHEAP)
     assert table["f1"].to_numpy() == pytest.approx(1.0)
 
 
@@ -51,7 +46,7 @@ def test_a_graph_against_itself_scores_one(lines: list[Any]) -> None:
 def test_a_graph_against_itself_connects_alike_and_lies_in_place(lines: list[Any]) -> None:
     drawn = [shapely.LineString(line) for line in lines]
     assume(shapely.length(shapely.union_all(drawn)) > sum(map(shapely.length, drawn)) - 0.01)  # no road above another
-    connected, beside = junctions(graph(lines), graph(lines)), lateral(graph(lines), graph(lines))
+    connected, beside = junctions(graph_of(*lines), graph_of(*lines)), lateral(graph_of(*lines), graph_of(*lines))
     assert connected.matched_proposal == connected.proposal == connected.reference
     assert connected.details["arms_not_found"] == 0
     assert (beside.f1, beside.details["rms_m"]) == (1.0, 0.0)
@@ -61,18 +56,19 @@ def test_a_graph_against_itself_connects_alike_and_lies_in_place(lines: list[Any
 @given(street_lines(), street_lines())
 def test_optimal_geo_is_symmetric_and_at_least_greedy(first: list[Any], second: list[Any]) -> None:
     there, back = (
-        geo(graph(a), graph(b), options=GeoOptions(matching="optimal")) for a, b in ((first, second), (second, first))
+        geo(graph_of(*a), graph_of(*b), options=GeoOptions(matching="optimal"))
+        for a, b in ((first, second), (second, first))
     )
     assert (there.precision, there.recall) == (back.recall, back.precision)
-    assert there.matched_proposal >= geo(graph(first), graph(second)).matched_proposal
+    assert there.matched_proposal >= geo(graph_of(*first), graph_of(*second)).matched_proposal
 
 
 @settings(max_examples=15, deadline=None)
 @given(street_lines(), street_lines(), st.integers(-10_000, 10_000))
 def test_moving_both_graphs_changes_nothing(first: list[Any], second: list[Any], shift: int) -> None:
     moved = [[[(x + shift, y - shift) for x, y in line] for line in lines] for lines in (first, second)]
-    before = evaluate(graph(first), graph(second), metrics=CHEAP)
-    after = evaluate(graph(moved[0]), graph(moved[1]), metrics=CHEAP)
+    before = evaluate(graph_of(*first), graph_of(*second), metrics=CHEAP)
+    after = evaluate(graph_of(*moved[0]), graph_of(*moved[1]), metrics=CHEAP)
     assert after["f1"].to_numpy() == pytest.approx(before["f1"].to_numpy(), abs=0.02)
 
 
@@ -89,7 +85,7 @@ def test_cutting_edges_changes_nothing(lines: list[Any], data: st.DataObject) ->
         cut = data.draw(st.booleans())
         pieces += [line[:2], line[1:]] if cut else [line]
     reference = [shapely.affinity.translate(shapely.LineString(line), 2.0, 1.0) for line in lines]
-    whole, cut = (itopo(graph(part), graph(reference)) for part in (lines, pieces))
+    whole, cut = (itopo(graph_of(*part), graph_of(*reference)) for part in (lines, pieces))
     assert cut.proposal == whole.proposal
     assert cut.matched_proposal == pytest.approx(whole.matched_proposal, abs=0.02 * whole.proposal + 1)
 
@@ -98,7 +94,7 @@ def test_cutting_edges_changes_nothing(lines: list[Any], data: st.DataObject) ->
 @given(street_lines(), street_lines(), st.floats(1.0, 20.0), st.floats(1.0, 20.0))
 def test_a_larger_radius_never_matches_less(first: list[Any], second: list[Any], a: float, b: float) -> None:
     near, far = (
-        geo(graph(first), graph(second), options=GeoOptions(radius=radius, matching="optimal"))
+        geo(graph_of(*first), graph_of(*second), options=GeoOptions(radius=radius, matching="optimal"))
         for radius in sorted((a, b))
     )
     assert near.matched_proposal <= far.matched_proposal

@@ -18,8 +18,8 @@ from probe2road.fleet.contract import fleet_from_tables
 from probe2road.recipe import BuildOptions, build
 from probe2road.segmentation.density import DensityOptions
 from probe2road.segmentation.options import SegmentationOptions
+from sketches import UTM, fleet_of
 
-CRS = "EPSG:32616"
 OPTIONS = BuildOptions(segmentation=SegmentationOptions(segmenter="density", density=DensityOptions(bandwidth=5.0)))
 UNREFINED = replace(OPTIONS, refine=False)
 FEW = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -41,8 +41,8 @@ def tables(draw):
     return table.assign(x=446000 + (table["x"] * 4).round() / 4, y=4636000 + (table["y"] * 4).round() / 4)
 
 
-def graph_of(table, options=OPTIONS):
-    return build(fleet_from_tables(table, crs=CRS, target_crs=CRS), options=options)
+def built(table, options=OPTIONS):
+    return build(fleet_from_tables(table, crs=UTM, keep_crs=True), options=options)
 
 
 def same(first, second, *, shift=(0.0, 0.0)):
@@ -56,7 +56,7 @@ def same(first, second, *, shift=(0.0, 0.0)):
 def test_the_order_of_the_traces_does_not_matter(table, random):
     names = list(table["trace_id"].unique())
     shuffled = dict(zip(names, random.sample(names, len(names)), strict=True))
-    same(graph_of(table), graph_of(table.assign(trace_id=table["trace_id"].map(shuffled))))
+    same(built(table), built(table.assign(trace_id=table["trace_id"].map(shuffled))))
 
 
 @FEW
@@ -67,27 +67,23 @@ def test_the_direction_of_the_traces_does_not_matter(table, random):
         if random.random() < 0.5:
             rows = table["trace_id"] == name
             turned.loc[rows, "t"] = -table.loc[rows, "t"]
-    same(graph_of(table, UNREFINED), graph_of(turned, UNREFINED))
+    same(built(table, UNREFINED), built(turned, UNREFINED))
 
 
 @FEW
 @given(tables(), st.integers(-500, 500), st.integers(-500, 500))
 def test_moving_the_traces_by_whole_pixels_moves_the_graph(table, east, north):
     moved = table.assign(x=table["x"] + east, y=table["y"] + north)
-    same(graph_of(table), graph_of(moved), shift=(east, north))
+    same(built(table), built(moved), shift=(east, north))
 
 
 @pytest.mark.parametrize("other", ["EPSG:32615", "EPSG:26971", "EPSG:4326"])
 def test_the_crs_that_the_traces_come_in_does_not_matter(other):
     rng = np.random.default_rng(5)
     at = np.arange(0, 600, 12.0)
-    table = pd.concat(
-        pd.DataFrame({"trace_id": number, "t": np.arange(50), "x": 446000.3 + at, "y": 4636000 + at / 3 + rng.normal()})
-        for number in range(10)
-    )
-    here = fleet_from_tables(table, crs=CRS, target_crs=CRS)
-    x, y = transform(table["x"].to_numpy(), table["y"].to_numpy(), here.crs, parse_crs(other))
-    there = fleet_from_tables(table.assign(x=x, y=y), crs=other, target_crs=CRS)
+    here = fleet_of(*(np.stack([446000.3 + at, 4636000 + at / 3 + rng.normal()], axis=1) for _ in range(10)))
+    x, y = transform(here.traces["x"].to_numpy(), here.traces["y"].to_numpy(), here.crs, parse_crs(other))
+    there = fleet_from_tables(here.traces.assign(x=x, y=y), crs=other, target_crs=UTM)
     assert np.abs(here.traces[["x", "y"]].to_numpy() - there.traces[["x", "y"]].to_numpy()).max() < 0.01
     first = shapely.get_coordinates(build(here, options=OPTIONS).edges.geometry.segmentize(1.0))
     second = build(there, options=OPTIONS).edges.geometry.to_numpy()

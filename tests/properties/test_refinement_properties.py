@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from probe2road.graph.check import check_graph
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import finish_edges
 from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, prune_gaps
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
+from sketches import graph_of
 
 NOBODY = pd.DataFrame({"trace_id": [], "edge": [], "entered": [], "left": []})
 
@@ -27,7 +28,7 @@ def graphs(draw: st.DrawFn) -> RoadGraph:
     ends = rng.uniform(0, size, (draw(st.integers(2, 12)), 2, 2))
     streets = [shapely.LineString(pair) for pair in ends]
     cut = shapely.get_parts(shapely.unary_union(streets[::2]))
-    return graph_from_lines([*cut, *streets[1::2]], crs="EPSG:32616")
+    return graph_of(*cut, *streets[1::2])
 
 
 @st.composite

@@ -6,11 +6,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from probe2road.raster.grid import Grid
 from probe2road.segmentation.segmenter import Segmenter
 from probe2road.segmentation.tiling import Merger, is_empty, predict_window, raster_windows, segment_raster
-
-CRS = "EPSG:32616"
+from sketches import grid_of
 
 
 def blurred(counts, grid):
@@ -27,10 +25,6 @@ def rasters(draw):
     halo = draw(st.integers(0, window))
     counts = np.random.default_rng(draw(st.integers(0, 2**32 - 1))).poisson(0.05, (3, rows, cols)).astype(np.uint32)
     return counts, Segmenter("test", blurred, window, halo, draw(st.booleans()), 0.5, 0.5, {})
-
-
-def grid_of(rows, cols):
-    return Grid.from_bounds((446000, 4636000, 446000 + cols - 0.5, 4636000 + rows - 0.5), crs=CRS)
 
 
 @settings(max_examples=25, deadline=None)

@@ -3,30 +3,22 @@ import pandas as pd
 import pytest
 
 from probe2road.errors import CRSError, InputError
-from probe2road.fleet.contract import Fleet, TraceGaps, fleet_from_tables
+from probe2road.fleet.contract import Fleet, TraceGaps
 from probe2road.raster.counts import count_pixels, fleet_grid, rasterize, rasterize_windows
+from probe2road.raster.drawing import draw_lines
 from probe2road.raster.grid import Grid
-from probe2road.raster.lines import draw_lines
+from sketches import fleet_of
 
-CRS = "EPSG:32616"
 ORIGIN = np.array([446000.0, 4636000.0])
 
 
-def fleet_of(*traces, points=()):
+def fleet_in_pixels(*traces, points=()):
     """A fleet whose traces are lists of (x, y) pixels east and north of the origin, one second apart."""
-    table = pd.concat(
-        [
-            pd.DataFrame(np.array(trace) + 0.5 + ORIGIN, columns=["x", "y"]).assign(
-                trace_id=number, t=np.arange(len(trace))
-            )
-            for number, trace in enumerate(traces)
-        ]
-    )
     semantic = None
     if points:
         semantic = pd.DataFrame(points, columns=["x", "y", "kind"]).assign(trace_id=0, t=0)
         semantic[["x", "y"]] += 0.5 + ORIGIN
-    return fleet_from_tables(table, semantic, crs=CRS, target_crs=CRS)
+    return fleet_of(*(np.array(trace) + 0.5 + ORIGIN for trace in traces), points=semantic)
 
 
 def counts_of(fleet, cols, rows, **options):
@@ -35,32 +27,32 @@ def counts_of(fleet, cols, rows, **options):
 
 
 def test_a_line_is_drawn_once_however_many_fixes_it_has():
-    sparse = counts_of(fleet_of([(0, 0), (8, 0)]), 9, 1)[0]
-    dense = counts_of(fleet_of([(x, 0) for x in range(9)]), 9, 1)[0]
+    sparse = counts_of(fleet_in_pixels([(0, 0), (8, 0)]), 9, 1)[0]
+    dense = counts_of(fleet_in_pixels([(x, 0) for x in range(9)]), 9, 1)[0]
     assert sparse.tolist() == dense.tolist() == [[1] * 9]
 
 
 def test_a_trace_that_comes_back_counts_again():
-    there_and_back = counts_of(fleet_of([(0, 0), (4, 0), (0, 0)]), 5, 1)[0]
+    there_and_back = counts_of(fleet_in_pixels([(0, 0), (4, 0), (0, 0)]), 5, 1)[0]
     assert there_and_back.tolist() == [[2, 2, 2, 2, 1]]
 
 
 def test_standing_still_counts_once():
-    assert counts_of(fleet_of([(2, 0)] * 5), 5, 1)[0].tolist() == [[0, 0, 1, 0, 0]]
+    assert counts_of(fleet_in_pixels([(2, 0)] * 5), 5, 1)[0].tolist() == [[0, 0, 1, 0, 0]]
 
 
 def test_a_gap_is_not_bridged():
-    counts = counts_of(fleet_of([(0, 0), (3, 0), (190, 0), (193, 0)]), 194, 1)[0]
+    counts = counts_of(fleet_in_pixels([(0, 0), (3, 0), (190, 0), (193, 0)]), 194, 1)[0]
     assert counts.sum() == 8
     bridged = counts_of(
-        fleet_of([(0, 0), (3, 0), (190, 0), (193, 0)]), 194, 1, gaps=TraceGaps(max_step=500, max_speed=500)
+        fleet_in_pixels([(0, 0), (3, 0), (190, 0), (193, 0)]), 194, 1, gaps=TraceGaps(max_step=500, max_speed=500)
     )
     assert bridged[0].sum() == 194
 
 
 @pytest.mark.parametrize("end", [(7, 0), (7, 3), (7, 7), (3, 7), (0, 7)])
 def test_bresenham_takes_one_pixel_a_step_within_half_a_pixel_of_the_line(end):
-    counts = counts_of(fleet_of([(0, 0), end]), 8, 8)[0]
+    counts = counts_of(fleet_in_pixels([(0, 0), end]), 8, 8)[0]
     row, col = np.nonzero(counts)
     across = np.abs((7 - row) * end[0] - col * end[1]) / max(end)
     assert counts.max() == 1
@@ -71,13 +63,13 @@ def test_bresenham_takes_one_pixel_a_step_within_half_a_pixel_of_the_line(end):
 def test_direction_does_not_matter():
     rng = np.random.default_rng(3)
     walk = rng.integers(0, 40, (30, 2)).tolist()
-    there, back = (counts_of(fleet_of(path), 40, 40)[0] for path in (walk, walk[::-1]))
+    there, back = (counts_of(fleet_in_pixels(path), 40, 40)[0] for path in (walk, walk[::-1]))
     np.testing.assert_array_equal(there, back)
 
 
 def test_points_are_counted_by_kind():
     points = [(1, 0, "lane_marking"), (1, 0, "lane_marking"), (2, 0, "road_boundary"), (99, 0, "road_boundary")]
-    counts = counts_of(fleet_of([(0, 0), (3, 0)], points=points), 4, 1)
+    counts = counts_of(fleet_in_pixels([(0, 0), (3, 0)], points=points), 4, 1)
     assert counts[1].tolist() == [[0, 2, 0, 0]]
     assert counts[2].tolist() == [[0, 0, 1, 0]]
 
@@ -85,7 +77,7 @@ def test_points_are_counted_by_kind():
 def test_windows_agree_with_the_whole():
     rng = np.random.default_rng(4)
     walks = [np.cumsum(rng.integers(-9, 10, (200, 2)), axis=0) + 60 for _ in range(5)]
-    fleet = fleet_of(*walks, points=[(x, x, "lane_marking") for x in range(100)])
+    fleet = fleet_in_pixels(*walks, points=[(x, x, "lane_marking") for x in range(100)])
     grid = fleet_grid(fleet, margin=3)
     whole = rasterize(fleet, grid)
     padded = np.pad(whole, ((0, 0), (7, 7), (7, 7)))
@@ -103,20 +95,20 @@ def test_windows_agree_with_the_whole():
 
 
 def test_a_finer_grid_keeps_the_number_of_traces():
-    fleet = fleet_of([(0, 0), (20, 0)])
+    fleet = fleet_in_pixels([(0, 0), (20, 0)])
     fine = rasterize(fleet, Grid.from_bounds(fleet.bounds, resolution=0.2, crs=fleet.crs))[0]
     assert fine.max() == 1
     assert fine.sum() == 101
 
 
 def test_an_empty_fleet_has_no_grid():
-    fleet = fleet_of([(0, 0)])
+    fleet = fleet_in_pixels([(0, 0)])
     with pytest.raises(InputError, match="no fixes"):
         fleet_grid(Fleet(fleet.traces.iloc[:0], fleet.points, fleet.crs))
 
 
 def test_the_grid_must_be_in_the_fleets_crs():
-    fleet = fleet_of([(0, 0)])
+    fleet = fleet_in_pixels([(0, 0)])
     with pytest.raises(CRSError, match="to_crs"):
         rasterize(fleet, Grid(0.0, 0.0, 1.0, 1, 1, fleet.to_crs("EPSG:32617").crs))
 

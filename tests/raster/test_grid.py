@@ -6,12 +6,11 @@ import rasterio
 
 from probe2road.errors import CRSError, InputError, OptionError
 from probe2road.raster.grid import Grid, read_raster, sparse_zeros, write_raster
-
-CRS = "EPSG:32616"
+from sketches import UTM
 
 
 def test_pixels_contain_their_positions():
-    grid = Grid.from_bounds((446000.2, 4636000.7, 446100.9, 4636050.1), resolution=0.5, crs=CRS)
+    grid = Grid.from_bounds((446000.2, 4636000.7, 446100.9, 4636050.1), resolution=0.5, crs=UTM)
     rng = np.random.default_rng(0)
     x, y = rng.uniform(446000.2, 446100.9, 500), rng.uniform(4636000.7, 4636050.1, 500)
     row, col = grid.rowcol(x, y)
@@ -22,21 +21,21 @@ def test_pixels_contain_their_positions():
 
 
 def test_rows_run_south():
-    grid = Grid.from_bounds((0, 0, 10, 10), crs=CRS)
+    grid = Grid.from_bounds((0, 0, 10, 10), crs=UTM)
     row, _ = grid.rowcol([5, 5], [9.5, 0.5])
     assert row[0] < row[1]
 
 
 def test_moving_the_data_by_whole_pixels_moves_the_grid():
-    here = Grid.from_bounds((446000.2, 4636000.7, 446100.9, 4636050.1), crs=CRS)
-    there = Grid.from_bounds((446010.2, 4635993.7, 446110.9, 4636043.1), crs=CRS)
+    here = Grid.from_bounds((446000.2, 4636000.7, 446100.9, 4636050.1), crs=UTM)
+    there = Grid.from_bounds((446010.2, 4635993.7, 446110.9, 4636043.1), crs=UTM)
     assert there.shape == here.shape
     assert (there.left - here.left, there.top - here.top) == (10, -7)
 
 
 def test_a_resolution_must_be_positive():
     with pytest.raises(OptionError, match="metres per pixel"):
-        Grid.from_bounds((0, 0, 1, 1), resolution=0, crs=CRS)
+        Grid.from_bounds((0, 0, 1, 1), resolution=0, crs=UTM)
 
 
 def test_degrees_are_refused():
@@ -45,7 +44,7 @@ def test_degrees_are_refused():
 
 
 def test_windows_cover_every_pixel_once():
-    grid = Grid.from_bounds((0, 0, 94, 41), crs=CRS)
+    grid = Grid.from_bounds((0, 0, 94, 41), crs=UTM)
     seen = np.zeros(grid.shape, int)
     for window in grid.windows(30, halo=4):
         seen[window.core] += 1
@@ -57,7 +56,7 @@ def test_windows_cover_every_pixel_once():
 
 @pytest.mark.parametrize("dtype", ["uint32", "float32", "bool", "uint8"])
 def test_a_raster_comes_back_from_its_file(tmp_path, dtype):
-    grid = Grid.from_bounds((446000, 4636000, 446099, 4636049), crs=CRS)
+    grid = Grid.from_bounds((446000, 4636000, 446099, 4636049), crs=UTM)
     array = (np.random.default_rng(1).random((2, *grid.shape)) * 9).astype(dtype)
     write_raster(tmp_path / "counts.tif", array, grid, names=["a", "b"])
     read, read_grid = read_raster(tmp_path / "counts.tif")

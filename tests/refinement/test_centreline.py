@@ -12,23 +12,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from probe2road.errors import CRSError, OptionError
-from probe2road.fleet.contract import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.check import check_graph
-from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.matching.match import match
 from probe2road.refinement.centreline import CentrelineOptions, refine_centreline
-
-CRS = "EPSG:32616"
+from sketches import UTM, fleet_of, graph_of, spaced
 
 
 def fleet(lines: list[list[tuple[float, float]]], points: pd.DataFrame | None = None) -> Fleet:
     """Return one trace per line, a fix each 10 m and 1 s."""
-    tables = []
-    for name, corners in enumerate(lines):
-        line = shapely.LineString(corners)
-        xy = shapely.get_coordinates(shapely.line_interpolate_point(line, np.arange(5.0, line.length, 10.0)))
-        tables.append(pd.DataFrame({"trace_id": name, "t": np.arange(len(xy)), "x": xy[:, 0], "y": xy[:, 1]}))
-    return fleet_from_tables(pd.concat(tables), points, crs=CRS, target_crs=CRS)
+    return fleet_of(*(spaced(*line, start=5.0) for line in lines), points=points)
 
 
 def refined(graph: RoadGraph, data: Fleet, **options: float) -> RoadGraph:
@@ -42,27 +36,27 @@ def heights(graph: RoadGraph) -> NDArray[np.float64]:
 
 
 def test_one_way_traffic_is_the_centre() -> None:
-    graph = graph_from_lines([[(0, 3), (600, 3)]], crs=CRS)
+    graph = graph_of([(0, 3), (600, 3)])
     moved = refined(graph, fleet([[(0, y), (600, y)] for y in (-1.0, 0.0, 0.0, 0.0, 1.0)]))
     assert np.abs(heights(moved)).max() < 0.3
     assert moved.nodes.geometry.y.abs().max() < 0.3
 
 
 def test_two_way_traffic_keeps_right_of_the_centre_however_uneven() -> None:
-    graph = graph_from_lines([[(0, 1), (600, 1)]], crs=CRS)
+    graph = graph_of([(0, 1), (600, 1)])
     there, back = [(0, -3), (600, -3)], [(600, 3), (0, 3)]
     moved = refined(graph, fleet([there] * 12 + [back] * 4))
     assert np.abs(heights(moved)).max() < 0.3
 
 
 def test_a_stretch_driven_one_way_stays_in_the_middle() -> None:
-    graph = graph_from_lines([[(0, 1), (900, 1)]], crs=CRS)
+    graph = graph_of([(0, 1), (900, 1)])
     moved = refined(graph, fleet([[(0, -3), (900, -3)]] * 6 + [[(400, 3), (0, 3)]] * 6))
     assert np.abs(heights(moved)).max() < 0.3
 
 
 def test_boundaries_outvote_traffic_on_the_right_lane() -> None:
-    graph = graph_from_lines([[(0, 0), (600, 0)]], crs=CRS)
+    graph = graph_of([(0, 0), (600, 0)])
     x = np.tile(np.arange(5.0, 600, 10), 2)
     points = [
         pd.DataFrame(
@@ -76,7 +70,7 @@ def test_boundaries_outvote_traffic_on_the_right_lane() -> None:
 
 
 def test_shift_is_bounded_and_few_traces_do_nothing() -> None:
-    graph = graph_from_lines([[(0, 12), (600, 12)]], crs=CRS)
+    graph = graph_of([(0, 12), (600, 12)])
     data = fleet([[(0, 0), (600, 0)]] * 5)
     assert heights(refined(graph, data, max_shift=2.0)) == pytest.approx(10.0, abs=0.3)
     few = fleet([[(0, 10), (600, 10)]] * 2)
@@ -85,7 +79,7 @@ def test_shift_is_bounded_and_few_traces_do_nothing() -> None:
 
 def test_junction_moves_with_its_edges_and_stays_one() -> None:
     arms = [(-300, 0), (300, 0), (0, 300), (0, -300)]
-    graph = graph_from_lines([[(2.0, 2.0), (x + 2.0, y + 2.0)] for x, y in arms], crs=CRS)
+    graph = graph_of(*([(2.0, 2.0), (x + 2.0, y + 2.0)] for x, y in arms))
     routes = [[a, (0, 0), b] for a in arms for b in arms if a != b]
     moved = refined(graph, fleet(routes))
     assert moved.nodes.index.tolist() == graph.nodes.index.tolist()
@@ -95,7 +89,7 @@ def test_junction_moves_with_its_edges_and_stays_one() -> None:
 
 def test_hairpin_does_not_fold() -> None:
     turn = [(20 * np.cos(a), 20 * np.sin(a)) for a in np.linspace(np.pi / 2, -np.pi / 2, 15)]
-    graph = graph_from_lines([[(-200, 20), *turn, (-200, -20)]], crs=CRS)
+    graph = graph_of([(-200, 20), *turn, (-200, -20)])
     inner = [(-200, 14), *((0.7 * x, 0.7 * y) for x, y in turn), (-200, -14)]
     moved = refined(graph, fleet([inner] * 6), max_shift=8.0)
     line = moved.edges.geometry[0]
@@ -104,7 +98,7 @@ def test_hairpin_does_not_fold() -> None:
 
 
 def test_heights_and_attributes_move_along() -> None:
-    graph = graph_from_lines([[(0, 2, 5.0), (300, 2, 8.0), (600, 2, 5.0)]], crs=CRS)
+    graph = graph_of([(0, 2, 5.0), (300, 2, 8.0), (600, 2, 5.0)])
     graph = replace(graph, edges=graph.edges.assign(name="A1"))
     moved = refined(graph, fleet([[(0, 0), (600, 0)]] * 5))
     z = shapely.get_coordinates(moved.edges.geometry.to_numpy(), include_z=True)[:, 2]
@@ -114,13 +108,13 @@ def test_heights_and_attributes_move_along() -> None:
 
 def test_nothing_to_do() -> None:
     data = fleet([[(0, 0), (600, 0)]])
-    assert len(refined(empty_graph(CRS), data).edges) == 0
-    far = graph_from_lines([[(0, 5000), (600, 5000)]], crs=CRS)
+    assert len(refined(empty_graph(UTM), data).edges) == 0
+    far = graph_of([(0, 5000), (600, 5000)])
     assert refined(far, data) is far
 
 
 def test_wrong_crs_and_options_are_refused() -> None:
-    graph, data = graph_from_lines([[(0, 0), (600, 0)]], crs=CRS), fleet([[(0, 0), (600, 0)]])
+    graph, data = graph_of([(0, 0), (600, 0)]), fleet([[(0, 0), (600, 0)]])
     with pytest.raises(CRSError):
         refine_centreline(graph.to_crs("EPSG:32617"), data, match(graph, data))
     for wrong in ({"spacing": 0.0}, {"max_shift": -1.0}, {"reach": float("nan")}):
@@ -133,7 +127,7 @@ def test_wrong_crs_and_options_are_refused() -> None:
 def test_any_graph_stays_a_graph(seed: int) -> None:
     rng = np.random.default_rng(seed)
     places = rng.uniform(0, 400, (6, 2))
-    graph = graph_from_lines([[tuple(places[a]), tuple(places[b])] for a, b in rng.integers(0, 6, (8, 2))], crs=CRS)
+    graph = graph_of(*([tuple(places[a]), tuple(places[b])] for a, b in rng.integers(0, 6, (8, 2))))
     routes = [[tuple(p) for p in places[rng.permutation(6)[:4]] + rng.normal(0, 4, (4, 2))] for _ in range(12)]
     moved = refined(graph, fleet(routes), min_traces=1)
     before, after = (shapely.get_coordinates(g.nodes.geometry) for g in (graph, moved))

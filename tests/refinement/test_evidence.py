@@ -14,7 +14,7 @@ from probe2road.errors import CRSError, InputError, OptionError, OutputError
 from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.graph.check import check_graph
 from probe2road.graph.direction import driving_direction, oneway_probabilities
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.matching.frame import edge_lines, frame, smooth_stations, stations_along
 from probe2road.matching.match import match
@@ -27,24 +27,20 @@ from probe2road.refinement.evidence import (
 from probe2road.refinement.heights import HeightOptions
 from probe2road.simulation.drawn.generate import generate_interchange
 from probe2road.simulation.fleet_simulation import simulate
+from sketches import UTM, graph_of, spaced
 
-CRS = "EPSG:32616"
 TEE = [[(0, 0), (200, 0)], [(200, 0), (400, 0)], [(200, 0), (200, 200)]]
 
 
 def drive(*corners: tuple[float, ...], name: object = 1, start: str = "2024-01-01", **columns: object) -> pd.DataFrame:
     """Return fixes each 10 m and 1 s along a line, whose heights come with it."""
-    line = shapely.LineString(corners)
-    xyz = shapely.get_coordinates(
-        shapely.line_interpolate_point(line, np.arange(5.0, line.length, 10.0)), include_z=True
-    )
-    times = pd.Timestamp(start, tz="UTC") + pd.to_timedelta(np.arange(len(xyz)), "s")
-    place = {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2]}
-    return pd.DataFrame({"trace_id": name, "t": times, **place, **columns})
+    table = pd.DataFrame(spaced(*corners, start=5.0), columns=["x", "y", "z"][: len(corners[0])])
+    times = pd.Timestamp(start, tz="UTC") + pd.to_timedelta(np.arange(len(table)), "s")
+    return table.assign(trace_id=name, t=times, **columns)
 
 
 def fleet(*drives: pd.DataFrame) -> Fleet:
-    return fleet_from_tables(pd.concat(drives, ignore_index=True), crs=CRS, target_crs=CRS)
+    return fleet_from_tables(pd.concat(drives, ignore_index=True), crs=UTM, keep_crs=True)
 
 
 def known(graph: RoadGraph, data: Fleet, **options: Any) -> RoadGraph:
@@ -53,7 +49,7 @@ def known(graph: RoadGraph, data: Fleet, **options: Any) -> RoadGraph:
 
 @pytest.fixture
 def tee() -> RoadGraph:
-    return graph_from_lines(TEE, crs=CRS)
+    return graph_of(*TEE)
 
 
 def test_counts_turns_and_speed(tee: RoadGraph) -> None:
@@ -104,7 +100,7 @@ def test_traces_without_a_clock_are_drives_of_their_own() -> None:
     ("forward", "backward", "expected"), [(12, 0, "yes"), (0, 12, "-1"), (40, 1, "yes"), (6, 6, "no"), (2, 0, None)]
 )
 def test_oneway_in_the_words_of_openstreetmap(forward: int, backward: int, expected: str | None) -> None:
-    graph = graph_from_lines(TEE[:1], crs=CRS)
+    graph = graph_of(*TEE[:1])
     there = [drive((0, 0), (200, 0), name=k) for k in range(forward)]
     back = [drive((200, 0), (0, 0), name=100 + k) for k in range(backward)]
     found = known(graph, fleet(*there, *back)).edges
@@ -120,7 +116,7 @@ def test_more_drives_the_same_way_are_more_certain() -> None:
 
 
 def test_a_sign_outranks_traffic() -> None:
-    graph = graph_from_lines(TEE[:1], crs=CRS)
+    graph = graph_of(*TEE[:1])
     graph = replace(graph, edges=graph.edges.assign(oneway="no"))
     found = known(graph, fleet(*(drive((0, 0), (200, 0), name=k) for k in range(20)))).edges
     assert found["oneway"].tolist() == ["no"]
@@ -132,7 +128,7 @@ def test_profile_of_a_bridge_from_traces_with_biases() -> None:
         return 100.0 + 6.0 * np.exp(-(((x - 500.0) / 150.0) ** 2))
 
     rng = np.random.default_rng(0)
-    graph = graph_from_lines([[(0, 0), (1000, 0)]], crs=CRS)
+    graph = graph_of([(0, 0), (1000, 0)])
     drives = []
     for k in range(30):
         table = drive((0, 0), (1000, 0), name=k)
@@ -152,7 +148,7 @@ def test_profile_of_a_bridge_from_traces_with_biases() -> None:
 
 def test_heights_meet_at_a_node_but_not_on_different_levels() -> None:
     lines = [[(0, 0), (200, 0)], [(200, 0), (400, 0)], [(200, -200), (200, 0)]]
-    graph = graph_from_lines(lines, crs=CRS)
+    graph = graph_of(*lines)
     flat = [drive((0, 0, 0.0), (200, 0, 0.0), name=k) for k in range(5)]
     flat += [drive((200, 0, 0.6), (400, 0, 0.6), name=10 + k) for k in range(5)]
     found = known(graph, fleet(*flat))
@@ -165,7 +161,7 @@ def test_heights_meet_at_a_node_but_not_on_different_levels() -> None:
 
 
 def test_fleet_without_heights_leaves_those_of_the_graph() -> None:
-    graph = graph_from_lines([[(0, 0, 5.0), (200, 0, 6.0)]], crs=CRS)
+    graph = graph_of([(0, 0, 5.0), (200, 0, 6.0)])
     data = fleet(drive((0, 0), (200, 0)))
     assert known(graph, data).edges.geometry[0].equals_exact(graph.edges.geometry[0])
 
@@ -175,7 +171,7 @@ def test_every_format_holds_the_evidence(tee: RoadGraph, suffix: str, tmp_path: 
     straight = [drive((0, 0, 3.0), (400, 0, 5.0), name=k, vehicle_id="AB"[k % 2]) for k in range(12)]
     found = known(tee, fleet(*straight))
     write_graph(found, tmp_path / f"roads.{suffix}")
-    back = read_graph(tmp_path / f"roads.{suffix}").to_crs(CRS)
+    back = read_graph(tmp_path / f"roads.{suffix}").to_crs(UTM)
     for column in EVIDENCE_COLUMNS:
         ours, theirs = found.edges[column], back.edges[column]
         assert ours.isna().tolist() == theirs.isna().tolist(), column
@@ -207,7 +203,7 @@ def test_wrong_matches_and_crs_are_refused(tee: RoadGraph) -> None:
     with pytest.raises(InputError, match="the fleet has 20"):
         add_evidence(tee, fleet(drive((0, 0), (200, 0))), found)
     with pytest.raises(InputError, match="edge 1 of the matches is not in the graph"):
-        add_evidence(graph_from_lines(TEE[:1], crs=CRS), data, found)
+        add_evidence(graph_of(*TEE[:1]), data, found)
     with pytest.raises(CRSError):
         add_evidence(tee.to_crs("EPSG:32617"), data, found)
 

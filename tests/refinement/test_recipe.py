@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pandas as pd
 import pytest
 import shapely
 
-from probe2road.fleet.contract import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet
 from probe2road.graph.check import check_graph
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.refinement.gaps.fill import GapOptions
 from probe2road.refinement.recipe import RefineOptions, refine
+from sketches import fleet_of, graph_of, spaced
 
-CRS = "EPSG:32616"
 # A road on a bridge over two others, whose mask is lost between them and has grown into both.
 LOST = [
     [(-200, 0), (100, 0)], [(180, 0), (500, 0)],
@@ -23,14 +21,9 @@ LOST = [
 
 def drives(n: int = 6) -> Fleet:
     """Drives on the bridge, and on both roads under it."""
-    along = np.arange(-290.0, 290.0, 10.0)
-    roads = [(200.0 + along, 0.0 * along, 8.0), (100.0 + 0.0 * along, along, 0.0), (180.0 + 0.0 * along, along, 0.0)]
-    tables = [
-        pd.DataFrame({"trace_id": n * road + k, "t": np.arange(len(x)), "x": x, "y": y, "z": z})
-        for road, (x, y, z) in enumerate(roads)
-        for k in range(n)
-    ]
-    return fleet_from_tables(pd.concat(tables), crs=CRS, target_crs=CRS)
+    bridge = spaced((-90, 0, 8), (480, 0, 8))
+    below = [spaced((x, -290, 0), (x, 280, 0)) for x in (100, 180)]
+    return fleet_of(*(road for road in (bridge, *below) for _ in range(n)))
 
 
 def refined(graph: RoadGraph, **gaps: float) -> RoadGraph:
@@ -40,7 +33,7 @@ def refined(graph: RoadGraph, **gaps: float) -> RoadGraph:
 
 
 def test_a_bridge_that_the_mask_lost_becomes_one_road_over_the_others() -> None:
-    graph = refined(graph_from_lines(LOST, crs=CRS))
+    graph = refined(graph_of(*LOST))
     assert sorted(graph.edges["length"].round()) == [600.0, 600.0, 700.0]
     assert graph.degrees().tolist() == [1] * 6
     assert (graph.edges["support"] == 6).all()
@@ -48,13 +41,13 @@ def test_a_bridge_that_the_mask_lost_becomes_one_road_over_the_others() -> None:
 
 @pytest.mark.parametrize("gaps", [{"max_jump": 70.0}, {"min_jumps": 7}])
 def test_without_proof_it_stays_in_pieces(gaps: dict[str, float]) -> None:
-    graph = refined(graph_from_lines(LOST, crs=CRS), **gaps)
+    graph = refined(graph_of(*LOST), **gaps)
     assert sorted(graph.edges["length"].round())[-1] < 700.0
 
 
 def test_one_way_edges_run_in_their_driving_direction() -> None:
     against = [[(500, 0), (-200, 0)], [(100, 300), (100, -300)], [(180, -300), (180, 300)]]
-    edges = refine(graph_from_lines(against, crs=CRS), drives(12), learned=False).edges
+    edges = refine(graph_of(*against), drives(12), learned=False).edges
     assert edges["oneway"].tolist() == ["yes"] * 3
     assert edges[["u", "v", "forward", "backward"]].to_numpy().tolist() == [[1, 0, 12, 0], [3, 2, 12, 0], [4, 5, 12, 0]]
     first, last = (shapely.get_coordinates(shapely.get_point(edges.geometry.to_numpy(), end)) for end in (0, -1))

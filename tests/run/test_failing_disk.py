@@ -16,16 +16,17 @@ import pytest
 
 from probe2road.errors import OutputError
 from probe2road.fleet.contract import fleet_from_tables
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet_files
 from probe2road.io.fleet_writer import write_fleet
 from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.io.table_writer import write_table
 from probe2road.run.stages import ROADS, WINDOW
 from probe2road.run.workspace import open_workspace
+from sketches import graph_of
 
-OLD = graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616")
-NEW = graph_from_lines([[(0, 0), (100, 0)], [(100, 0), (100, 90)], [(100, 0), (200, 0)]], crs="EPSG:32616")
+OLD = graph_of([(0, 0), (100, 0)])
+NEW = graph_of([(0, 0), (100, 0)], [(100, 0), (100, 90)], [(100, 0), (200, 0)])
 SUFFIXES = (".gpkg", ".parquet", ".fgb", ".geojson", ".graphml", ".osm", ".osm.pbf")
 
 
@@ -162,7 +163,7 @@ def test_a_file_that_the_system_cuts_short_is_refused_as_such(tmp_path: Path, su
     path = tmp_path / f"roads{suffix}"
     write_graph(OLD, path)
     before = state(read_graph(path))
-    big = graph_from_lines([[(x, 0), (x + 1, 7 * x % 13), (x + 2, 0)] for x in range(0, 900, 2)], crs="EPSG:32616")
+    big = graph_of(*([(x, 0), (x + 1, 7 * x % 13), (x + 2, 0)] for x in range(0, 900, 2)))
     sizes = [0, 100, 4096, 12_000]
     for size in sizes:
         with largest_file(size):

@@ -15,13 +15,13 @@ import pytest
 from probe2road.demo import demo_fleet
 from probe2road.errors import OutputError
 from probe2road.fleet.contract import Fleet
-from probe2road.graph.roadgraph import graph_from_lines
 from probe2road.io.atomic import atomic_path
 from probe2road.raster.grid import Grid
 from probe2road.run.stages import DENSITY, PROBABILITY, ROADS, WINDOW
 from probe2road.run.workspace import copy_segmentation, open_workspace, resumable
+from sketches import graph_of
 
-ROAD = graph_from_lines([[(0, 0), (100, 0)]], crs="EPSG:32616")
+ROAD = graph_of([(0, 0), (100, 0)])
 GRID = Grid.from_bounds((0, 0, 4, 2), crs=ROAD.crs)
 
 

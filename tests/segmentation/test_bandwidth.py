@@ -2,11 +2,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe2road.fleet.contract import Fleet, fleet_from_tables
+from probe2road.fleet.contract import Fleet
 from probe2road.raster.counts import fleet_grid
 from probe2road.segmentation.bandwidth import estimate_bandwidth, lateral_spread
-
-CRS = "EPSG:32616"
+from sketches import fleet_of
 
 
 def road(offsets, *, heading=30.0, length=900.0, seed=0):
@@ -14,11 +13,10 @@ def road(offsets, *, heading=30.0, length=900.0, seed=0):
     rng = np.random.default_rng(seed)
     along, (east, north) = np.arange(0.0, length, 18.0), (np.sin(np.radians(heading)), np.cos(np.radians(heading)))
     traces = []
-    for number, offset in enumerate(offsets):
+    for offset in offsets:
         at = along if rng.random() < 0.5 else along[::-1]
-        x, y = 446000 + at * east + offset * north, 4636000 + at * north - offset * east
-        traces.append(pd.DataFrame({"trace_id": number, "t": np.arange(len(at)), "x": x, "y": y}))
-    return fleet_from_tables(pd.concat(traces), crs=CRS, target_crs=CRS)
+        traces.append(np.stack([446000 + at * east + offset * north, 4636000 + at * north - offset * east], axis=1))
+    return fleet_of(*traces)
 
 
 def spread_of(fleet):
@@ -58,6 +56,5 @@ def test_too_few_traces_to_tell():
 
 
 def test_standing_vehicles_only():
-    table = pd.DataFrame({"trace_id": 1, "t": range(20), "x": 446000.0, "y": 4636000.0})
-    fleet = fleet_from_tables(table, crs=CRS, target_crs=CRS)
+    fleet = fleet_of([(446000.0, 4636000.0)] * 20)
     assert estimate_bandwidth(fleet, fleet_grid(fleet)) == 5.0

@@ -1,33 +1,19 @@
 import numpy as np
-import pandas as pd
 import pytest
 from scipy import ndimage
 
 from probe2road.errors import OptionError
-from probe2road.fleet.contract import fleet_from_tables
 from probe2road.raster.counts import fleet_grid, rasterize, rasterize_windows
-from probe2road.raster.grid import Grid
 from probe2road.segmentation.density import DensityOptions, density_probability, density_segmenter
-
-CRS = "EPSG:32616"
-
-
-def grid_of(rows, cols):
-    return Grid(446000.0, 4636000.0, 1.0, rows, cols, fleet_of_lines([0.0], 1).crs)
+from sketches import fleet_of, grid_of
 
 
 def fleet_of_lines(offsets, n_traces, *, noise=0.0, length=900.0, seed=0):
     """Traces along straight roads at these offsets north of the origin, each with its own lateral offset."""
     rng = np.random.default_rng(seed)
-    x = np.arange(0.0, length, 20.0)
-    traces = [
-        pd.DataFrame({"trace_id": f"{road}-{number}", "t": np.arange(len(x)), "x": 446000 + x}).assign(
-            y=4636000 + offset + rng.normal(0, noise)
-        )
-        for road, offset in enumerate(offsets)
-        for number in range(n_traces)
-    ]
-    return fleet_from_tables(pd.concat(traces), crs=CRS, target_crs=CRS)
+    x = 446000 + np.arange(0.0, length, 20.0)
+    y = 4636000 + np.repeat(offsets, n_traces) + rng.normal(0, noise, len(offsets) * n_traces)
+    return fleet_of(*(np.stack([x, np.full(len(x), north)], axis=1) for north in y))
 
 
 def rows_of(probability, threshold=0.5):

@@ -2,11 +2,9 @@ import logging
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet.contract import fleet_from_tables
 from probe2road.raster.counts import fleet_grid, rasterize
 from probe2road.raster.grid import Grid
 from probe2road.recipe import BuildOptions, build
@@ -16,8 +14,8 @@ from probe2road.segmentation.network import NetworkOptions, find_weights, networ
 from probe2road.segmentation.options import SegmentationOptions
 from probe2road.segmentation.tiling import segment_raster
 from probe2road.segmentation.weights import read_weights
+from sketches import UTM, fleet_of
 
-CRS = "EPSG:32616"
 GNSS = ("traces",)
 
 
@@ -29,10 +27,10 @@ def crossing(*, points=False, n=8):
     for number in range(2 * n):
         along, across = at, np.full(len(at), 400.0 + rng.normal(0, 1.0))
         x, y = (along, across) if number % 2 else (across, along)
-        drives.append(pd.DataFrame({"trace_id": number, "t": np.arange(len(at)), "x": 446000 + x, "y": 4636000 + y}))
-    table = pd.concat(drives)
-    seen = table[["trace_id", "t", "x", "y"]].assign(z=0.0, kind="lane_marking") if points else None
-    return fleet_from_tables(table, seen, crs=CRS, target_crs=CRS)
+        drives.append(np.stack([446000 + x, 4636000 + y], axis=1))
+    fleet = fleet_of(*drives)
+    seen = fleet.traces[["trace_id", "t", "x", "y"]].assign(z=0.0, kind="lane_marking")
+    return fleet_of(*drives, points=seen) if points else fleet
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +180,7 @@ def test_options_that_mean_nothing_are_refused(changes, message, fleet, write_we
 
 
 def test_a_network_that_is_asked_four_times_sees_no_direction():
-    grid = Grid(446000.0, 4636512.0, 1.0, 512, 512, CRS)
+    grid = Grid(446000.0, 4636512.0, 1.0, 512, 512, UTM)
     counts = np.random.default_rng(3).poisson(0.02, (1, 512, 512)).astype(np.uint32)
     counts[0, 250:260, 40:] += 9
     weights = read_weights(shipped_weights(points=False))

@@ -2,15 +2,9 @@ import numpy as np
 import pytest
 
 from probe2road.errors import InputError
-from probe2road.raster.grid import Grid
 from probe2road.segmentation.segmenter import Segmenter
 from probe2road.segmentation.tiling import Merger, raster_windows, segment_raster
-
-CRS = "EPSG:32616"
-
-
-def grid_of(rows, cols):
-    return Grid.from_bounds((446000, 4636000, 446000 + cols - 0.5, 4636000 + rows - 0.5), crs=CRS)
+from sketches import grid_of
 
 
 def segmenter(predict, *, window=8, halo=4, blend=True):

@@ -14,8 +14,7 @@ from probe2road.graph.check import check_graph
 from probe2road.simulation.fleet_simulation import simulate, simulate_chunks
 from probe2road.simulation.networks.network import network_from_sections
 from probe2road.simulation.presets import PRESETS, find_preset, read_preset
-
-CRS = "EPSG:32616"
+from sketches import UTM
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +29,7 @@ def network():
     ]
     highway = ["motorway"] * 4 + ["motorway_link"]
     tunnel = [False, False, True, False, False]
-    return network_from_sections(lines, crs=CRS, highway=highway, lanes_forward=[3, 3, 3, 3, 1], tunnel=tunnel)
+    return network_from_sections(lines, crs=UTM, highway=highway, lanes_forward=[3, 3, 3, 3, 1], tunnel=tunnel)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +39,7 @@ def made(network):
 
 def test_the_fleet_keeps_its_contract(made):
     fleet = made.fleet
-    again = fleet_from_tables(fleet.traces, fleet.points, crs=fleet.crs, target_crs=fleet.crs)
+    again = fleet_from_tables(fleet.traces, fleet.points, crs=fleet.crs, keep_crs=True)
     pd.testing.assert_frame_equal(again.traces, fleet.traces)
     assert len(again.points) == len(fleet.points)
     assert int(trace_breaks(fleet).sum()) == fleet.n_traces == 12

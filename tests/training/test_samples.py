@@ -11,8 +11,8 @@ from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.fleet_writer import points_path
 from probe2road.io.graph_files import read_graph
 from probe2road.raster.counts import rasterize
+from probe2road.raster.drawing import label_mask
 from probe2road.raster.grid import Grid
-from probe2road.raster.lines import label_mask
 from probe2road.training.samples import SampleOptions, draw_sample, square
 from probe2road.training.scene import load_scene, make_scene, rows_around, save_scene
 from probe2road.training.sources import TrainingSource, open_scene

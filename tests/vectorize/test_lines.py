@@ -16,16 +16,13 @@ from probe2road.raster.counts import Grid
 from probe2road.vectorize.lines import VectorizeOptions, vectorize
 from probe2road.vectorize.skeleton import skeleton_pixels, skeletonize
 from probe2road.vectorize.tracing import trace_pixels
+from sketches import mask_of
 
 HALF_DIAGONAL = 0.5**0.5  # px
 
 
 def grid_of(rows: int, cols: int, *, resolution: float = 1.0) -> Grid:
     return Grid(448000.0, 4636000.0, resolution, rows, cols, CRS("EPSG:32616"))
-
-
-def mask_of(*rows: str) -> NDArray[np.bool_]:
-    return np.array([[pixel == "#" for pixel in row] for row in rows])
 
 
 def drawn(*lines: shapely.LineString, width: float = 7.0, size: int = 160) -> NDArray[np.bool_]:

@@ -18,12 +18,9 @@ from probe2road.vectorize.skeleton import (
     skeletonize_windows,
     thin_state,
 )
+from sketches import mask_of
 
 Mask = NDArray[np.bool_]
-
-
-def mask_of(*rows: str) -> Mask:
-    return np.array([[pixel == "#" for pixel in row] for row in rows])
 
 
 def random_mask(seed: int) -> Mask:

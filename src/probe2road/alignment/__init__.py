@@ -1,4 +1,4 @@
-"""Fleet alignment: noisy drives moved to where they agree."""
+"""Fleet alignment: noisy drives moved so that they agree with each other."""
 
 from pkgutil import iter_modules
 

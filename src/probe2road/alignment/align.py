@@ -1,4 +1,4 @@
-"""Fleet alignment: the drives of a fleet moved to where they agree with each other and, on average, with GNSS.
+"""Fleet alignment: drives moved so that they agree with each other and, on average, with GNSS.
 
 See docs/concepts/alignment.md for the method (METHOD 9.2).
 """
@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """An aligned fleet and what alignment did to it."""
+    """An aligned fleet, and a report of what alignment changed."""
 
     fleet: Fleet
     report: AlignmentReport
@@ -39,13 +39,13 @@ class Alignment:
         return f"Alignment({self.fleet!r}, {self.report!r})"
 
     def _repr_html_(self) -> str:
-        """Show figures in a notebook, and no id."""
+        """Show figures in a notebook, without any ids."""
         return f"<b>Alignment</b><br>{self.fleet._repr_html_()}{self.report._repr_html_()}"
 
 
 @dataclass(frozen=True)
 class _Run:
-    """What decides, beside the fleet, what a tile gives."""
+    """The inputs, besides the fleet, that determine the result of a tile."""
 
     options: AlignOptions
     held: int  # drives that do not move
@@ -59,24 +59,24 @@ def align(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> Alignment:
-    """Bring the drives of a fleet together.
+    """Align the drives of a fleet with each other.
 
-    Drives are tied to each other by the lane markings and road boundaries that they saw, or, without points, weakly by
-    their paths; the whole stays where GNSS puts it on average. Nothing is fixed: one drive alone keeps its place, and
-    is smoothed at most.
+    Drives are connected by the lane markings and road boundaries that they saw, or, without points, weakly by their
+    paths; on average, they stay where GNSS has them. No drive is fixed: a single drive keeps its place, and is only
+    smoothed.
 
     Parameters
     ----------
     fleet
-        Raw fleet data; ``heading``, ``speed`` and ``accuracy`` are used where they are there. Not changed.
+        Raw fleet data; ``heading``, ``speed`` and ``accuracy`` are used if present. Not changed.
     options
-        How.
+        None takes the defaults.
     workspace
-        Folder that keeps the result of each tile, from which an interrupted run goes on.
+        Folder that keeps the result of each tile, so that an interrupted run can continue.
     workers
-        Processes; no influence on the result beyond the tolerance of the solver, millimetres.
+        Number of processes; it changes the result by no more than the tolerance of the solver, millimetres.
     progress
-        Called as the work goes on.
+        Called during the work.
 
     Returns
     -------
@@ -114,7 +114,7 @@ def add_drives(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> Alignment:
-    """Align new drives to an aligned fleet, which does not move.
+    """Align new drives to an aligned fleet that does not move.
 
     Only tiles that new drives touch are worked on. There, old drives are the map: they hold the lines where they
     are, and the new ones are registered on them and optimised between them. Where no old drive was, new drives are
@@ -187,7 +187,7 @@ def _align(
 
 
 def _joined(one: Fleet, other: Fleet) -> Fleet:
-    """Put two fleets of one CRS together, in the order that the contract wants."""
+    """Join two fleets of one CRS, in the order that the contract requires."""
     traces = pd.concat([one.traces, other.traces], ignore_index=True)
     points = pd.concat([one.points, other.points], ignore_index=True)
     points["kind"] = pd.Categorical(points["kind"], categories=POINT_KINDS)
@@ -196,7 +196,7 @@ def _joined(one: Fleet, other: Fleet) -> Fleet:
 
 
 def _without(fleet: Fleet, ids: pd.Series) -> Fleet:
-    """Return a fleet less some of its drives."""
+    """Return a fleet without some of its drives."""
     return replace(
         fleet,
         traces=fleet.traces[~fleet.traces["trace_id"].isin(ids)].reset_index(drop=True),

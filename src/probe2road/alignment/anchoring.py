@@ -1,4 +1,4 @@
-"""Anchoring: roads that all their drives were led away from are put back to where GNSS has them.
+"""Anchoring: roads moved back to their recorded positions where alignment has moved all their drives away.
 
 Registration compares each drive with all others, so it finds a drive that lies a lane aside and not a road whose drives
 lie there together, as they may where another road joins: they agree, and none leaves alone. One drive says little about
@@ -21,8 +21,8 @@ from probe2road.alignment.profiles import RoadPlaces
 __all__ = ["anchored"]
 
 _DOUBT = 3.0  # standard errors of the middle of all recorded positions
-_LEAST = 1.5  # m; by less, about half a lane, a road may be off: drives share errors of GNSS
-_AROUND = 11  # keyframes of a chain over which moves are made alike
+_LEAST = 1.5  # m, about half a lane; a road may be wrong by less, because drives share errors of GNSS
+_AROUND = 11  # keyframes of a chain over which moves are smoothed
 
 
 def anchored(
@@ -35,22 +35,22 @@ def anchored(
     *,
     held: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
-    """Move roads back that lie further from the middle of their recorded positions than GNSS can be off.
+    """Move roads back if they lie further from the median of their recorded positions than GNSS errors explain.
 
     Parameters
     ----------
     frames
         The keyframes as recorded.
     pose
-        Where they are now: x, y (m), direction (radians), shape ``(k, 3)``.
+        Present poses of the keyframes: x, y (m), direction (radians), shape ``(k, 3)``.
     angle
-        Direction of the road at each, radians, shape ``(k,)``.
+        Direction of the road at each keyframe, radians, shape ``(k,)``.
     home
-        Floor of each, -1 where it has none, shape ``(k,)``.
+        Floor of each keyframe, -1 for none, shape ``(k,)``.
     places
         Neighbours of each floor along the road.
     options
-        Of which ``min_drives`` is used.
+        Only ``min_drives`` is used.
     held
         Keyframes that stay, shape ``(k,)``; so do roads that one of them is on.
 
@@ -64,9 +64,9 @@ def anchored(
     middle, drives = middles(floor, recorded_aside(frames, pose, angle)[on], frames.drive[on], n)
     sigma = np.bincount(floor, frames.sigma[on], n) / np.maximum(np.bincount(floor, minlength=n), 1)
     doubt = _DOUBT * sigma / np.sqrt(np.maximum(drives, 1))
-    led_away = (np.abs(middle) > np.maximum(doubt, _LEAST)) & (drives >= options.min_drives)
+    moved_away = (np.abs(middle) > np.maximum(doubt, _LEAST)) & (drives >= options.min_drives)
     wanted, beside_held = np.zeros(len(pose)), np.zeros(len(pose), bool)
-    wanted[on] = np.where(led_away, middle, 0.0)[floor]
+    wanted[on] = np.where(moved_away, middle, 0.0)[floor]
     has_held = np.append(np.bincount(floor, held[on], n) > 0, False)  # the last one is no floor
     beside_held[on] = (has_held[:-1] | has_held[places.before] | has_held[places.after])[floor]
     shift = np.where(held, 0.0, _smoothed(wanted, beside_held, frames.starts))
@@ -74,7 +74,7 @@ def anchored(
 
 
 def _smoothed(values: NDArray[np.float64], fixed: NDArray[np.bool_], starts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Take the median, then the mean, of the values around each, chain by chain; 0 around what is fixed."""
+    """Return the running median, then mean, of the values of each chain; 0 around keyframes that are fixed."""
     smooth = values.copy()
     for begin, end in pairwise(starts):
         part = values[begin:end]

@@ -1,4 +1,4 @@
-"""The alignment of one area: the recipe, from recorded drives to poses that agree.
+"""The alignment of one area: from recorded drives to poses that agree.
 
 Everything here is held in memory at once; `probe2road.alignment.tiling` cuts larger data into areas.
 """
@@ -33,15 +33,15 @@ logger = logging.getLogger(__name__)
 _SEARCH_BIN = 0.25  # m, of the shifts tried in registration
 _SEARCH_KERNEL = 0.3  # m
 _SEARCH_DOUBT = 0.7  # keyframes
-_SEARCH_TEMPER = 0.25  # points of neighbouring keyframes see the same paint with the same camera
-_TRIAL_ROUNDS = 2  # before registration is repeated
-_LEAST_MOVE = 0.1  # m, by which a shift may change between keyframes, however near
+_SEARCH_TEMPER = 0.25  # weight of a point; low, because neighbouring keyframes see the same paint with the same camera
+_TRIAL_ROUNDS = 2  # rounds before registration is repeated
+_LEAST_MOVE = 0.1  # m, by which a shift may always change between keyframes
 _LANE_GATE = 3.0  # lane sigmas beyond which a path does not belong to the middle of all
 
 
 @dataclass(frozen=True)
 class AlignedArea:
-    """Where the keyframes of an area are after alignment, and what it took.
+    """The keyframes of an area after alignment, and how the alignment went.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class AlignedArea:
 
 @dataclass(frozen=True)
 class _Scene:
-    """What does not change while an area is aligned."""
+    """The inputs that stay the same while an area is aligned."""
 
     frames: Keyframes
     seen: Sightings
@@ -101,7 +101,7 @@ def align_area(fleet: Fleet, options: AlignOptions, *, held: NDArray[np.bool_] |
     held = np.zeros(fleet.n_traces, bool) if held is None else held
     scene = _Scene(frames, sightings(fleet, frames), held[frames.drive], _chains(frames, held), options)
     pose = optimise(frames, frames.pose, _nothing(), np.zeros((0, 3)), options, held=scene.held)
-    # Drives that were too far off to be found the first time are nearer the second time, on a map of all the others.
+    # Drives that were too far away to be registered at first are nearer the second time, on a map of all the others.
     for settled, gates in ((False, options.gates[:_TRIAL_ROUNDS]), (True, options.gates)):
         spines = find_spines(replace(frames, pose=pose), scene.chains.placing, options)
         pose, floors, level = _register(scene, pose, spines, settled=settled)
@@ -123,7 +123,7 @@ def _iterate(
     *,
     robust_gnss: bool,
 ) -> tuple[NDArray[np.float64], LineMatches, list[float]]:
-    """Match and optimise in turn until the residuals stay as they are: poses, last matches, residual by round."""
+    """Match and optimise in turn until the residuals converge: return poses, last matches, and residual by round."""
     rounds: list[float] = []
     for gate in gates:
         pose, matches = _round(scene, pose, spines, floors, level, gate, robust_gnss=robust_gnss)
@@ -134,7 +134,7 @@ def _iterate(
 
 
 def _chains(frames: Keyframes, held: NDArray[np.bool_]) -> Chains:
-    """Chains by what they believe of their accuracy, and by length."""
+    """Return the chains, sorted by their stated accuracy and then by length."""
     starts = frames.starts
     n = np.diff(starts)
     order = np.lexsort((-n, np.round(np.add.reduceat(frames.sigma, starts[:-1]) / n, 1)))
@@ -147,7 +147,7 @@ def _nothing() -> Condensed:
 
 
 def _points_on_spines(scene: _Scene, pose: NDArray[np.float64], spines: Spines) -> OnSpines:
-    """Project all points, each with the direction of its keyframe."""
+    """Project all points on the spines, each with the direction of its keyframe."""
     x, y, theta = pose[scene.seen.keyframe].T
     ahead, left = scene.seen.body.T
     cos, sin = np.cos(theta), np.sin(theta)
@@ -163,7 +163,7 @@ def _points_on_floors(
     floors: Floors,
     level: NDArray[np.float64],
 ) -> tuple[OnSpines, NDArray[np.int64]]:
-    """Project all points, and find their floors: that of their keyframes, -1 for points beside another spine.
+    """Project all points, and return the floors of their keyframes; -1 for points beside another spine.
 
     What a keyframe sees of another spine says where it is across that one, not across its own.
     """
@@ -177,7 +177,7 @@ def _points_on_floors(
 def _register(
     scene: _Scene, pose: NDArray[np.float64], spines: Spines, *, settled: bool
 ) -> tuple[NDArray[np.float64], Floors, NDArray[np.float64]]:
-    """Bring drives onto one another, first in height, then across the road: poses, floors, heights."""
+    """Register drives on each other, first in height, then across the road: return poses, floors and heights."""
     frames, options = scene.frames, scene.options
     on = project(spines, pose, options)
     level = route_heights(frames, on, spines, options, held=scene.held)
@@ -217,7 +217,7 @@ def _round(
     *,
     robust_gnss: bool,
 ) -> tuple[NDArray[np.float64], LineMatches]:
-    """Match points to lines and optimise: new poses, and the matches that led to them."""
+    """Match points to lines and optimise: return the new poses, and the matches that led to them."""
     options, frame = scene.options, scene.seen.keyframe
     on = project(spines, pose, options)
     points, floor = _points_on_floors(scene, pose, on, spines, floors, level)
@@ -256,7 +256,7 @@ def _paths(
     level: NDArray[np.float64],
     sighted: NDArray[np.int64],
 ) -> Condensed:
-    """Attract drives whose camera saw nothing to the middle of all paths: weakly, because lanes differ."""
+    """Pull drives whose camera saw nothing towards the middle of all paths: weakly, because lanes differ."""
     options = scene.options
     floor = floor_of(floors, on.cell, spines.above(on.station, level), options)
     blind = floor >= 0
@@ -277,7 +277,7 @@ def _paths(
 
 
 def _patch_poses(spines: Spines, floors: Floors) -> NDArray[np.float64]:
-    """Pose of the spine at the cell of each floor: shape ``(floors, 3)``."""
+    """Return the pose of the spine at the cell of each floor: shape ``(floors, 3)``."""
     station = np.searchsorted(spines.along, (floors.cell + 0.5) * CELL)
     return spines.station[np.clip(station, 0, len(spines.station) - 1)]
 
@@ -290,7 +290,7 @@ def _result(
     matches: LineMatches,
     rounds: list[float],
 ) -> AlignedArea:
-    """Put the result together; what residuals were before is measured against the same lines."""
+    """Put the result together; residuals before alignment are measured to the same lines as those after it."""
     frames, at = scene.frames, matches.point
     keyframe = scene.seen.keyframe[at]
     sights = np.bincount(keyframe, minlength=len(frames.row))
@@ -302,7 +302,7 @@ def _result(
         x, y = scene.seen.body[at].T
         turn = wrapped(moved[:, 2])
         cos, sin = np.cos(pose[keyframe, 2]), np.sin(pose[keyframe, 2])
-        # A turn of the keyframe moves what lies ahead of it sideways.
+        # A rotation of the keyframe moves points ahead of it sideways.
         dx = moved[:, 0] - turn * (sin * x + cos * y)
         dy = moved[:, 1] + turn * (cos * x - sin * y)
         before = matches.residual - np.sin(angle) * dx + np.cos(angle) * dy

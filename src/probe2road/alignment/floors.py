@@ -1,12 +1,12 @@
-"""Floors: which roads lie above each other, so that stacked roads never attract each other.
+"""Floors: which roads lie above each other, so that alignment never draws stacked roads together.
 
 Strategy
 --------
-Raw heights are off by metres, as much as two decks of a bridge are apart. Drives that surely are on one road are
-brought to one height first (`probe2road.alignment.routes`). Then heights at each place are joined, the nearest first,
-until the groups that are left lie further apart than the errors of so many drives explain: every group is a floor. A
-group is where its mean is; were gaps all that counts, a few drives between two decks would weld them. All later stages
-work on floors; a spine with two decks has two at each of its cells.
+Raw heights have errors of metres, as much as two decks of a bridge are apart. Drives that are certainly on one road
+are moved to one height first (`probe2road.alignment.routes`). Then heights at each place are joined, the nearest first,
+until the remaining groups lie further apart than the errors of so many drives explain: every group is a floor. Groups
+are compared by their means: if only gaps counted, a few drives between two decks would join them. All later stages
+work on floors; a spine with two decks has two floors at each of its cells.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = ["Floors", "find_floors", "floor_of", "middles"]
 _LOOK_AHEAD = 4  # cells ahead of a keyframe in which it sees things, and one behind
 _FAR = 10_000.0  # m, more than any height
 _BIN = 0.25  # m; heights that are nearer are not told apart
-_DOUBT = 2.0  # sigmas of the difference of two groups within which they are one floor
+_DOUBT = 2.0  # sigmas of the difference of two groups, up to which they are one floor
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Floors:
 
     @property
     def patch(self) -> NDArray[np.int64]:
-        """Floor that stands for each floor and the next: shape ``(f,)``."""
+        """Return the floor that stands for each floor and the next one: shape ``(f,)``."""
         own = np.arange(len(self.cell))
         return np.where((self.cell % 2 == 1) & (self.places.before >= 0), self.places.before, own)
 
@@ -49,7 +49,7 @@ class Floors:
 def find_floors(
     frames: Keyframes, on: OnSpines, height: NDArray[np.float64], spines: Spines, options: AlignOptions
 ) -> Floors:
-    """Group the heights at every cell.
+    """Group the heights at every cell into floors.
 
     Parameters
     ----------
@@ -93,10 +93,10 @@ def find_floors(
 def _heights_of_passes(
     frames: Keyframes, on: OnSpines, height: NDArray[np.float64], spines: Spines
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Mean height of each pass at each cell that it drives through or looks at: cells, heights, and what GNSS knows.
+    """Return the mean height of each pass at each cell that it crosses or sees: cells, heights, and information.
 
-    A pass is a drive from where it comes onto a spine to where it leaves it. The last is the inverse of the variance
-    of its height on its own, 1/m2.
+    A pass is the part of a drive between entering and leaving a spine. Its information is the inverse variance of its
+    own height, 1/m2.
     """
     spine = spines.spine_of(on.cell)
     passes = np.cumsum((np.diff(spine, prepend=-2) != 0) | frames.first)
@@ -118,7 +118,7 @@ def _heights_of_passes(
 def _joined(
     starts: NDArray[np.int64], middle: NDArray[np.float64], weight: NDArray[np.float64], gate: float
 ) -> NDArray[np.int64]:
-    """Join neighbouring groups within each stretch, nearest first: the floor of each group, ascending."""
+    """Join neighbouring groups within each stretch, the nearest first: return the floor of each group, ascending."""
     floor = np.empty(len(middle), np.int64)
     found = 0
     for stretch in range(len(starts) - 1):
@@ -151,7 +151,7 @@ def _joined(
 def floor_of(
     floors: Floors, cell: NDArray[np.int64], height: NDArray[np.float64], options: AlignOptions
 ) -> NDArray[np.int64]:
-    """Find the floor of positions by cell and height.
+    """Return the floor of positions, given by cell and height.
 
     Returns
     -------
@@ -175,7 +175,7 @@ def floor_of(
 def middles(
     floor: NDArray[np.int64], left: NDArray[np.float64], drive: NDArray[np.int64], n: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the median offset of the paths on each of n floors, and how many drives there are, shape ``(n,)`` each."""
+    """Return the median offset of the paths on each of n floors, and the number of drives, shape ``(n,)`` each."""
     order = np.lexsort((left, floor))
     count = np.bincount(floor, minlength=n)
     middle = np.zeros(n)

@@ -27,9 +27,9 @@ __all__ = ["optimise"]
 _GNSS_KERNEL = 4.0  # sigmas of one fix beyond which GNSS counts less (Cauchy)
 _SIGHT_KERNEL = 10.0  # sigmas of a condensed factor beyond which it counts less (Cauchy)
 _HEADING_SIGMA = 3.0  # degrees, of the recorded heading; weak, it only keeps patches from turning
-_PATCH_SIGMA = (20.0, 20.0, 0.1)  # m, m, radians; where a patch would be without anything said about it
+_PATCH_SIGMA = (20.0, 20.0, 0.1)  # m, m, radians; weak prior of a patch at its start position
 _ITERATIONS = 15
-_TOLERANCE = 1e-4  # of the relative decrease of the error
+_TOLERANCE = 1e-4  # relative decrease of the error, below which the solver stops
 
 
 def optimise(
@@ -43,7 +43,7 @@ def optimise(
     fixed_patch: NDArray[np.bool_] | None = None,
     robust_gnss: bool = True,
 ) -> NDArray[np.float64]:
-    """Find the poses that fit odometry, GNSS and what was seen best.
+    """Find the poses that fit odometry, GNSS and camera observations best.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def optimise(
 
 
 def _add_motion(graph: object, frames: Keyframes, held: NDArray[np.bool_]) -> None:
-    """Tie each keyframe to the one before; nothing is added between drives."""
+    """Add a factor between each keyframe and the one before; drives are not connected."""
     import gtsam
 
     for k in np.flatnonzero(~frames.first & ~held).tolist():
@@ -116,7 +116,7 @@ def _add_motion(graph: object, frames: Keyframes, held: NDArray[np.bool_]) -> No
 def _add_gnss(
     graph: object, frames: Keyframes, moving: NDArray[np.int64], options: AlignOptions, *, robust: bool
 ) -> None:
-    """Add the recorded position and heading of every keyframe, weakened by what its neighbours share with it."""
+    """Add a factor for the recorded position and heading of every keyframe, weaker because neighbours share errors."""
     import gtsam
 
     inflation = frames.inflation(options)
@@ -139,7 +139,7 @@ def _add_sights(
     held: NDArray[np.bool_],
     fixed: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
-    """Tie keyframes to what they saw; returns the patches that may move."""
+    """Add factors between keyframes and the patches that they saw; return the patches that may move."""
     import gtsam
 
     kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(_SIGHT_KERNEL)

@@ -20,9 +20,9 @@ from probe2road.alignment.options import AlignOptions
 __all__ = ["VERTICAL", "solve_heights"]
 
 VERTICAL = 1.6  # vertical over horizontal error of GNSS under open sky
-_FLOOR_SIGMA = 0.1  # m, of a drive about its floors
+_FLOOR_SIGMA = 0.1  # m, 1 sigma of a drive about the heights of its floors
 _FLOOR_KERNEL = 1.0  # sigmas beyond which a floor counts less
-_CHANGE_SIGMA = 0.05  # m, of the change of height between keyframes, however short
+_CHANGE_SIGMA = 0.05  # m, least 1 sigma of the change of height between keyframes
 _KERNEL = 2.0  # sigmas of one fix beyond which GNSS counts less (Cauchy)
 _ROUNDS = 3
 
@@ -36,7 +36,7 @@ def solve_heights(
     held: NDArray[np.bool_],
     start: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the heights that drives on the same floor agree on.
+    """Find heights on which the drives of each floor agree.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def solve_heights(
 
 
 def _difference(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> csr_matrix:
-    """Matrix whose rows are unknown ``one`` minus unknown ``other``."""
+    """Return the matrix whose rows give unknown ``one`` minus unknown ``other``."""
     row = np.arange(len(one))
     values = np.concatenate([np.ones(len(one)), -np.ones(len(one))])
     return csr_matrix((values, (np.concatenate([row, row]), np.concatenate([one, other]))), (len(one), n))

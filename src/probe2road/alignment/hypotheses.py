@@ -1,4 +1,4 @@
-"""What speaks for every shift of every keyframe, and the best sequence of shifts.
+"""Scores of every shift of every keyframe, and the best sequence of shifts.
 
 Strategy
 --------
@@ -29,20 +29,20 @@ _OWN_DOUBT = 0.3  # keyframes whose average view they are mixed with
 
 
 class Track(NamedTuple):
-    """Where k keyframes are and how well that is known, in the terms of the values of `Sights`."""
+    """The positions of k keyframes and their uncertainty, in the coordinates of the values of `Sights`."""
 
-    home: NDArray[np.int64]  # (k,) the place of each, -1 where it has none
-    own: NDArray[np.float64]  # (k,) m, where each is
-    recorded: NDArray[np.float64]  # (k,) m, where it was recorded, less where it is: zero unless it was moved before
+    home: NDArray[np.int64]  # (k,) the place of each keyframe, -1 for none
+    own: NDArray[np.float64]  # (k,) m, position of each keyframe
+    recorded: NDArray[np.float64]  # (k,) m, recorded minus present position: zero unless the keyframe was moved before
     move_sigma: NDArray[np.float64]  # (k,) m, by how much the shift may change since the keyframe before, 1 sigma
     prior_sigma: NDArray[np.float64]  # (k,) m, how far the recorded position may be off, inflated for shared errors
 
 
 @njit(cache=True)
 def gnss_scores(begin: int, end: int, track: Track, profiles: Profiles, search: ShiftSearch) -> NDArray[np.float64]:
-    """Log-likelihood of the recorded positions under every shift: shape ``(end - begin, shifts)``.
+    """Return the log-likelihood of the recorded positions under every shift: shape ``(end - begin, shifts)``.
 
-    GNSS wants a drive to do what those did who passed before: to leave its recorded position by as much.
+    The most likely shift of a drive is the mean shift of the drives that were placed there before.
     """
     reach = int(np.round(search.reach / search.bin))
     score = np.zeros((end - begin, 2 * reach + 1))
@@ -103,10 +103,10 @@ def _score_missing(
     alone: NDArray[np.float32],
     score: NDArray[np.float64],
 ) -> None:
-    """Take from the score of every shift what should have been seen of a kind, given where others saw it."""
+    """Subtract from the score of every shift what others saw of a kind there and this keyframe did not see."""
     view, n_bins, reach = profiles.average[which], profiles.votes.shape[2], len(score) // 2
     doubt = search.doubt * view.max()
-    # No more of it is missed than the camera reported at all.
+    # The weight is limited by what the camera reported of this kind at all.
     weight = search.temper * min(seen / max(view.sum(), 1e-9), 1.0)
     line, could = profiles.votes[track.home[k], which], profiles.looked[track.home[k], which]
     start = int(np.round((track.own[k] + search.half_width) / search.bin)) - len(view) // 2
@@ -124,7 +124,7 @@ def _score_missing(
 def own_rates(
     begin: int, end: int, sights: Sights, track: Track, profiles: Profiles, search: ShiftSearch
 ) -> NDArray[np.float32]:
-    """Rate of what a chain sees, relative to the average, at each offset around each keyframe, that one left out.
+    """Return how often a chain sees something at each offset around each keyframe (left out), relative to the average.
 
     Shape ``(end - begin, kinds, bins)``.
     """
@@ -133,7 +133,7 @@ def own_rates(
     seen = np.zeros((end - begin, kinds, n_bins), np.float32)
     could = np.zeros((end - begin, kinds, n_bins), np.float32)
     nowhere, nothing = np.full(1, -1, np.int64), np.zeros(1)
-    # A map of one place for each keyframe, on which only that keyframe is.
+    # A map with one place for each keyframe, which holds only that keyframe.
     here = Sights(sights.first, np.zeros(len(sights.value), np.int64), sights.value, sights.kind)
     for k in range(begin, end):
         i = k - begin
@@ -153,7 +153,7 @@ def own_rates(
 
 @njit(cache=True)
 def _around(values: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Sum of the values within the window around each, itself left out."""
+    """Return, for every value, the sum of the other values within its window."""
     n = len(values)
     sums = np.empty(n)
     total = 0.0
@@ -170,7 +170,7 @@ def _around(values: NDArray[np.float32]) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def best_path(score: NDArray[np.float64], move_sigma: NDArray[np.float64], search: ShiftSearch) -> NDArray[np.float64]:
-    """Best sequence of shifts (m), shape ``(k,)``, for scores ``(k, shifts)``: the Viterbi algorithm."""
+    """Return the best sequence of shifts (m), shape ``(k,)``, for scores ``(k, shifts)``: the Viterbi algorithm."""
     k, shifts = score.shape
     reach = (shifts - 1) // 2
     best = score.copy()

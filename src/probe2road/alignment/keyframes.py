@@ -1,4 +1,4 @@
-"""From traces to keyframes: the poses that the factor graph moves, the motion between them, and what was seen there.
+"""From traces to keyframes: the poses that the factor graph moves, the motion between them, and their sightings.
 
 Strategy
 --------
@@ -30,10 +30,10 @@ __all__ = [
     "sightings",
 ]
 
-_UNKNOWN_SHARE = 0.02  # of the distance, 1 sigma of the motion, where dead reckoning cannot check it
-_TURN_SHARE = 0.15  # of distance times turn (radians), 1 sigma: what lies between sparse fixes on a bend is not known
-_FIRST_SIGMA = 0.02  # m, of the motion, however short
-_UNSEEN = 0.3  # m/s2, 1 sigma, of the acceleration that neither of two fixes shows, for dead reckoning between them
+_UNKNOWN_SHARE = 0.02  # share of the distance, 1 sigma of the motion without dead reckoning
+_TURN_SHARE = 0.15  # share of distance times turn (radians), 1 sigma of the unknown path between sparse fixes
+_FIRST_SIGMA = 0.02  # m, least 1 sigma of a motion
+_UNSEEN = 0.3  # m/s2, 1 sigma of the unseen acceleration between two fixes, for dead reckoning
 
 
 @dataclass(frozen=True)
@@ -50,20 +50,20 @@ class Keyframes:
     distance: NDArray[np.float64]  # (k,) m driven; ascending over all drives
     pose: NDArray[np.float64]  # (k, 3) m, m, radians, as recorded
     z: NDArray[np.float64]  # (k,) m, NaN where unknown
-    sigma: NDArray[np.float64]  # (k,) m, of one horizontal axis of the recorded position
+    sigma: NDArray[np.float64]  # (k,) m, 1 sigma of the recorded position along one horizontal axis
     motion: NDArray[np.float64]  # (k, 3) m forward, m to the left, radians: from the keyframe before
     motion_sigma: NDArray[np.float64]  # (k, 3)
-    fix_distance: NDArray[np.float64]  # (n,) the same for every fix
+    fix_distance: NDArray[np.float64]  # (n,) m driven, of every fix
 
     @property
     def starts(self) -> NDArray[np.int64]:
-        """Keyframe at which each chain starts, then their number: shape ``(chains + 1,)``."""
+        """Return the first keyframe of each chain, then the number of keyframes: shape ``(chains + 1,)``."""
         first = np.flatnonzero(np.diff(self.chain, prepend=-1))
         return np.append(first, len(self.chain))
 
     def inflation(self, options: AlignOptions) -> NDArray[np.float64]:
-        """Factor on the sigma of whatever has errors that neighbours share, so that all together count once: (k,)."""
-        # A keyframe stands for the road to the next one. Sparse fixes share less, and a short chain counts as one, too.
+        """Return the factor on sigmas by which observations with shared errors count as one: shape ``(k,)``."""
+        # A keyframe represents the road to the next one. Sparse fixes share less error; a short chain counts as one.
         step = np.diff(self.distance, append=self.distance[-1:])
         starts = self.starts
         length = np.add.reduceat(np.where(np.append(self.first[1:], True), 0.0, step), starts[:-1])
@@ -72,13 +72,13 @@ class Keyframes:
 
     @property
     def first(self) -> NDArray[np.bool_]:
-        """Whether a keyframe is the first of its chain: shape ``(k,)``."""
+        """Tell which keyframes are the first of their chain: shape ``(k,)``."""
         return np.diff(self.chain, prepend=-1) > 0
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """P points fixed to keyframes, in the order of these."""
+    """P points attached to keyframes, in the order of the keyframes."""
 
     keyframe: NDArray[np.int64]  # (p,)
     body: NDArray[np.float64]  # (p, 2) m forward and to the left of the keyframe
@@ -86,7 +86,7 @@ class Sightings:
 
 
 def recorded_aside(frames: Keyframes, pose: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far to the left of its pose each keyframe was recorded, m, for directions of roads (radians)."""
+    """Return how far left of its pose each keyframe was recorded, m, given the directions of roads (radians)."""
     east, north = (frames.pose[:, :2] - pose[:, :2]).T
     return np.asarray(np.cos(angle) * north - np.sin(angle) * east)
 
@@ -94,7 +94,7 @@ def recorded_aside(frames: Keyframes, pose: NDArray[np.float64], angle: NDArray[
 def moved_aside(
     pose: NDArray[np.float64], angle: NDArray[np.float64], shift: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Move poses to the left (m) of the directions of their roads (radians)."""
+    """Return poses moved to the left (m) of the directions of their roads (radians)."""
     return pose + np.column_stack([-shift * np.sin(angle), shift * np.cos(angle), np.zeros(len(pose))])
 
 
@@ -147,7 +147,7 @@ def keyframes(fleet: Fleet, options: AlignOptions) -> Keyframes:
 
 
 def sightings(fleet: Fleet, frames: Keyframes) -> Sightings:
-    """Fix the points of a fleet to the keyframes nearest along their drives.
+    """Attach the points of a fleet to the nearest keyframes along their drives.
 
     Points that no fix accounts for are left out.
     """
@@ -166,7 +166,7 @@ def sightings(fleet: Fleet, frames: Keyframes) -> Sightings:
 
 
 def _chosen(distance: NDArray[np.float64], chain: NDArray[np.int64], spacing: float) -> NDArray[np.bool_]:
-    """Choose the first and last fix of each chain, and the first in each stretch of the spacing."""
+    """Choose as keyframes the first and last fix of each chain, and the first fix in each interval of the spacing."""
     first = np.flatnonzero(np.diff(chain, prepend=-1))
     stretch = np.floor((distance - distance[first][chain]) / spacing + 1e-9)
     chosen = np.diff(stretch, prepend=-1.0) != 0
@@ -184,7 +184,7 @@ def _motions(
     chain: NDArray[np.int64],
     options: AlignOptions,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Motion to each keyframe from the one before, in the frame of that one, and its sigmas: (k, 3) each."""
+    """Return the motion from the keyframe before to each keyframe, in the frame of the former, and sigmas: (k, 3)."""
     total = np.vstack([np.zeros(2), np.cumsum(np.nan_to_num(reckoned), axis=0)])
     unknown = np.concatenate([[0], np.cumsum(~np.isfinite(reckoned).all(axis=1))])
     before = np.maximum(np.arange(len(row)) - 1, 0)
@@ -212,7 +212,7 @@ def _motions(
 
 
 def _nearest_keyframe(frames: Keyframes, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Keyframe nearest along the drive to each fix, of the same chain."""
+    """Return the nearest keyframe of the same chain along the drive, for each fix."""
     before = np.searchsorted(frames.row, rows, side="right") - 1
     after = np.minimum(before + 1, len(frames.row) - 1)
     at = frames.fix_distance[rows]

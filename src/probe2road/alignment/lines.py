@@ -1,4 +1,4 @@
-"""Lines that several drives saw, points matched to them, and the matches of a keyframe condensed into one factor.
+"""Lines that several drives saw, points matched to them, and one factor for all matches of a keyframe to a patch.
 
 Strategy
 --------
@@ -23,8 +23,8 @@ __all__ = ["Condensed", "LineMatches", "condense", "match_lines"]
 
 _BIN = 0.1  # m, of the profile in which peaks are found
 _HALF_WIDTH = 25.0  # m, to either side of a spine
-_PEAK_APART = 1.2  # m; of two peaks nearer than this the higher one is a line, the other may be drives that are off
-_LEAST_POINTS = 5.0  # that make a line
+_PEAK_APART = 1.2  # m; of two peaks nearer than this, only the higher one is a line: the other may be misplaced drives
+_LEAST_POINTS = 5.0  # fewest points of a line
 _STEEPEST = 0.1  # m of slope per metre along
 _INDEPENDENT = 8.0  # points of a keyframe that count; more share their errors
 _LOOSE = np.diag([1e-4, 1e-4, 1e-2])  # information that keeps a factor regular: 100 m, 6 degrees
@@ -32,7 +32,7 @@ _LOOSE = np.diag([1e-4, 1e-4, 1e-2])  # information that keeps a factor regular:
 
 @dataclass(frozen=True)
 class LineMatches:
-    """Points on lines: m matched points."""
+    """m points matched to lines."""
 
     point: NDArray[np.int64]  # (m,) index of the point
     line: NDArray[np.int64]  # (m,)
@@ -42,7 +42,7 @@ class LineMatches:
 
 @dataclass(frozen=True)
 class Condensed:
-    """What keyframes say about their poses relative to patches: one row a pair, q pairs."""
+    """Measurements of the poses of keyframes relative to patches: q pairs, one row for each."""
 
     keyframe: NDArray[np.int64]  # (q,)
     patch: NDArray[np.int64]  # (q,)
@@ -113,7 +113,7 @@ def condense(
     *,
     gate: float,
 ) -> Condensed:
-    """Add up what the points of a keyframe say about its pose relative to each patch.
+    """Sum up what the points of a keyframe measure about its pose relative to each patch.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def condense(
 def _peaks(
     group: NDArray[np.int64], left: NDArray[np.float64], gate: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Peaks of the density of points across the road in each group: group and offset (m) of each, sorted."""
+    """Find the peaks of the point density across the road in each group: return group and offset (m), sorted."""
     n_bins = int(2 * _HALF_WIDTH / _BIN)
     groups, index = np.unique(group, return_inverse=True)
     bins = np.clip(((left + _HALF_WIDTH) / _BIN).astype(np.int64), 0, n_bins - 1)
@@ -168,7 +168,7 @@ def _peaks(
     density = gaussian_filter1d(density, width / _BIN, axis=1, mode="constant")
     least = 0.5 * _LEAST_POINTS * _BIN / (width * np.sqrt(2.0 * np.pi))
     apart = 2 * round(_PEAK_APART / _BIN) + 1
-    density += np.linspace(0.0, 0.02, n_bins, dtype=np.float32)  # of two equal peaks one wins
+    density += np.linspace(0.0, 0.02, n_bins, dtype=np.float32)  # so that one of two equal peaks is higher
     row, at = np.nonzero((density == maximum_filter1d(density, apart, axis=1)) & (density > least))
     return groups[row], np.asarray((at + 0.5) * _BIN - _HALF_WIDTH, np.float64)
 
@@ -180,7 +180,7 @@ def _nearest_peak(
     left: NDArray[np.float64],
     gate: float,
 ) -> NDArray[np.int64]:
-    """Index of the nearest peak of its group to each point, -1 where there is none within the gate."""
+    """Return the nearest peak of its group for each point, -1 if none is within the gate."""
     if len(peak_group) == 0:
         return np.full(len(group), -1, np.int64)
     span = 4.0 * _HALF_WIDTH  # groups lie this far apart on one axis, so that one search serves all
@@ -194,11 +194,11 @@ def _nearest_peak(
 def _residuals(
     line: NDArray[np.int64], along: NDArray[np.float64], left: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit each line to its points: residual of each point (m,), slope of each line."""
+    """Fit a straight line to the points of each line: return the residual of each point (m,), and the slopes."""
     count = np.maximum(np.bincount(line), 1)
     mean_along, mean_left = (np.bincount(line, values) / count for values in (along, left))
     da, dl = along - mean_along[line], left - mean_left[line]
-    # One metre squared for each point keeps short stretches of line from turning.
+    # One square metre for each point keeps short stretches of line from rotating.
     slope = np.bincount(line, da * dl) / (np.bincount(line, da * da) + count)
     slope = np.clip(slope, -_STEEPEST, _STEEPEST)
     return dl - slope[line] * da, slope

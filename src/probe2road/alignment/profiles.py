@@ -1,4 +1,4 @@
-"""The map that drives are registered on: a profile across the road for each place along it, one for each kind of thing.
+"""The map on which drives are registered: profiles across the road for each place along it, one for each kind.
 
 Strategy
 --------
@@ -29,38 +29,38 @@ __all__ = [
     "empty_profiles",
 ]
 
-_VIEW_SMOOTHING = 1.5  # m, 1 sigma: of the fleet's view to the side, so that single lines do not show in it
+_VIEW_SMOOTHING = 1.5  # m, 1 sigma, over which the average view of the fleet is smoothed, to hide single lines
 _SPREAD_ALONG = 2  # places to which a vote spreads, either way
-_SPREAD_DECAY = 0.75  # of a vote, from place to place
+_SPREAD_DECAY = 0.75  # share of a vote that spreads from place to place
 
 
 class RoadPlaces(NamedTuple):
-    """N places along roads: where the profiles of the map are."""
+    """N places along roads, each with a profile in the map."""
 
     before: NDArray[np.int64]  # (n,) the place behind, -1 at the end of a road
     after: NDArray[np.int64]  # (n,) the place ahead
 
     @classmethod
     def from_roads(cls, road: NDArray[np.int64]) -> RoadPlaces:
-        """Line up places that are sorted by road and along it."""
+        """Connect places that are sorted by road and along it."""
         index = np.arange(len(road))
         same = np.concatenate([[False], road[1:] == road[:-1], [False]])
         return cls(np.where(same[:-1], index - 1, -1), np.where(same[1:], index + 1, -1))
 
 
 class ShiftSearch(NamedTuple):
-    """What shifts are tried, and how sharp the map is."""
+    """The shifts to try, and the resolution of the map."""
 
     reach: float  # m, the largest shift
     bin: float  # m
     half_width: float  # m, of a profile
     kernel: float  # m, 1 sigma, by which a vote is spread
-    doubt: float  # keyframes that must have looked at a place before what they saw counts half
+    doubt: float  # keyframes that must look at a place before their observations have half the weight
     temper: float  # weight of one observation; below 1, because neighbouring ones share errors
 
 
 class Sights(NamedTuple):
-    """What k keyframes saw, in coordinates of places: o observations, in the order of the keyframes."""
+    """The o observations of k keyframes in coordinates of places, in the order of the keyframes."""
 
     first: NDArray[np.int64]  # (k + 1,) observation at which each keyframe begins, then their number
     place: NDArray[np.int64]  # (o,)
@@ -69,19 +69,19 @@ class Sights(NamedTuple):
 
 
 class Profiles(NamedTuple):
-    """The map of n places; the code that places drives changes it as it goes."""
+    """The map of n places; registration changes its arrays in place."""
 
     before: NDArray[np.int64]  # (n,) as in `RoadPlaces`
     after: NDArray[np.int64]  # (n,)
     average: NDArray[np.float64]  # (kinds, bins) what a keyframe sees on average, by distance to its side; odd number
     votes: NDArray[np.float32]  # (n, kinds, bins) what was seen
-    looked: NDArray[np.float32]  # (n, kinds, bins) what would be seen on average by those who looked
-    moved: NDArray[np.float64]  # (n,) m, by how much those who passed left their recorded positions, in total
-    passed: NDArray[np.float64]  # (n,) how many they are
+    looked: NDArray[np.float32]  # (n, kinds, bins) what those who looked there would see on average
+    moved: NDArray[np.float64]  # (n,) m, sum of the shifts of the keyframes that passed
+    passed: NDArray[np.float64]  # (n,) number of keyframes that passed
 
 
 def empty_profiles(places: RoadPlaces, view: NDArray[np.float64], search: ShiftSearch) -> Profiles:
-    """Return a map on which nothing is yet."""
+    """Return an empty map."""
     n_bins = int(2 * search.half_width / search.bin) + 1
     n, shape = len(places.before), (len(places.before), len(view), n_bins)
     return Profiles(
@@ -93,16 +93,16 @@ def empty_profiles(places: RoadPlaces, view: NDArray[np.float64], search: ShiftS
 def average_view(
     sights: Sights, keyframe: NDArray[np.int64], own: NDArray[np.float64], search: ShiftSearch
 ) -> NDArray[np.float64]:
-    """Count what a keyframe sees on average by distance to its side.
+    """Count the average observations of a keyframe by their lateral distance from it.
 
     Parameters
     ----------
     sights
-        What was seen.
+        The observations.
     keyframe
-        By whom, shape ``(o,)``.
+        Keyframe of each observation, shape ``(o,)``.
     own
-        Where each keyframe is, in the terms of the values, shape ``(k,)``.
+        Position of each keyframe, in the coordinates of the values, shape ``(k,)``.
     search
         Width and bins of the profiles.
 
@@ -123,7 +123,7 @@ def average_view(
 
 @njit(cache=True)
 def add_sights(k: int, sign: float, shift: float, sights: Sights, profiles: Profiles, search: ShiftSearch) -> None:
-    """Add what keyframe k saw to the map, shifted, or take it away with a negative sign."""
+    """Add the observations of keyframe k to the map, moved by a shift, or subtract them if ``sign`` is negative."""
     radius = int(np.ceil(2.5 * search.kernel / search.bin))
     kernel = np.empty(2 * radius + 1)
     for o in range(sights.first[k], sights.first[k + 1]):
@@ -141,7 +141,7 @@ def add_sights(k: int, sign: float, shift: float, sights: Sights, profiles: Prof
 def add_view(
     k: int, sign: float, at: float, place: int, sights: Sights, profiles: Profiles, search: ShiftSearch
 ) -> None:
-    """Add how far keyframe k could see from where it is, of each kind of which it saw anything, or take it away."""
+    """Add the view of keyframe k, for each kind that it observed, to the map; subtract it if ``sign`` is negative."""
     view = profiles.average
     first = int(np.round((at + search.half_width) / search.bin)) - view.shape[1] // 2
     for which in range(len(view)):
@@ -162,7 +162,7 @@ def _spread(
     after: NDArray[np.int64],
     histograms: NDArray[np.float32],
 ) -> None:
-    """Add a kernel, from bin ``first`` on, to the histogram of a place and, less, to those around it."""
+    """Add a kernel, starting at bin ``first``, to the histogram of a place and, with less weight, of its neighbours."""
     low, high = max(-first, 0), min(len(kernel), histograms.shape[1] - first)
     for ahead in (True, False):
         at, weight = place, scale

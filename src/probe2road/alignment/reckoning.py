@@ -1,4 +1,4 @@
-"""Dead reckoning: the way between fixes by heading and speed, and positions steadied by it.
+"""Dead reckoning: motion between fixes from heading and speed, and positions smoothed with it.
 
 Strategy
 --------
@@ -21,21 +21,21 @@ from probe2road.fleet.contract import Fleet, fix_intervals, trace_breaks
 __all__ = ["fixes_course", "reckoned_steps", "steadying", "wrapped"]
 
 _COURSE_STEP = 2.0  # m; shorter steps leave the course as it was
-_BRIDGED = 10.0  # s between fixes over which heading and speed still tell the way
+_BRIDGED = 10.0  # s between fixes, up to which heading and speed give the motion
 _STEADY_TIME = 20.0  # s before and after a fix over which the median is taken
-_STEADY_FIXES = 41  # of them, at most; denser ones are skipped evenly
-_LEG_TIME = 10.0  # s, of the legs that the reckoned path is fitted by
-_LEG = 50.0  # m, the least length of one
+_STEADY_FIXES = 41  # most fixes for the median; of denser ones, some are skipped evenly
+_LEG_TIME = 10.0  # s, length of the legs to which the reckoned path is fitted
+_LEG = 50.0  # m, least length of a leg
 _LEAST_LEGS = 10
 
 
 def wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bring angles into -pi to pi."""
+    """Return angles wrapped to the range -pi to pi."""
     return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi, np.float64)
 
 
 def fixes_course(fleet: Fleet, breaks: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Direction of travel at every fix: the recorded heading, or where there is none, that of the positions.
+    """Return the direction of travel at every fix: the recorded heading, or the course of the positions without one.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def fixes_course(fleet: Fleet, breaks: NDArray[np.bool_]) -> NDArray[np.float64]
     course = np.arctan2(leg[:, 1], leg[:, 0])
     moving = np.hypot(*leg.T) >= _COURSE_STEP
     chain = np.cumsum(breaks) - 1
-    # The last moving fix before, or else the first behind, within the chain.
+    # The course of the last moving fix before in the chain, or else of the first one after.
     last = np.maximum.accumulate(np.where(moving, np.arange(n), -1))
     following = np.minimum.accumulate(np.where(moving, np.arange(n), n - 1)[::-1])[::-1]
     source = np.where((last >= 0) & (chain[last] == chain), last, following)
@@ -73,7 +73,7 @@ def fixes_course(fleet: Fleet, breaks: NDArray[np.bool_]) -> NDArray[np.float64]
 
 
 def reckoned_steps(fleet: Fleet, theta: NDArray[np.float64], breaks: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Motion from the fix before, by heading and speed.
+    """Return the motion from the fix before to every fix, from heading and speed.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def reckoned_steps(fleet: Fleet, theta: NDArray[np.float64], breaks: NDArray[np.
 
 
 def steadying(fleet: Fleet) -> NDArray[np.float64]:
-    """By how much to move every fix so that it follows its reckoned path, at the place where GNSS has that.
+    """Return the correction of every fix that makes it follow its reckoned path, at the place where GNSS has that path.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def _fitted(
     chain: NDArray[np.int64],
     owner: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Turn and stretch the reckoned steps (n, 2) of each drive by its median difference to the positions."""
+    """Rotate and scale the reckoned steps (n, 2) of each drive by their median difference from the positions."""
     n = len(xy)
     ends = np.minimum(np.searchsorted(seconds, seconds + _LEG_TIME), n - 1)
     path = np.cumsum(steps, axis=0)
@@ -166,11 +166,11 @@ def _fitted(
 def _running_median(
     values: NDArray[np.float64], seconds: NDArray[np.float64], chain: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Median of each column (n, 2) over the fixes of the chain that are near in time."""
+    """Return the median of each column (n, 2) over the fixes of the same chain that are near in time."""
     n = len(values)
     result = np.empty_like(values)
     first = 0
-    last = 0  # one beyond
+    last = 0  # one behind the last fix of the window
     for i in range(n):
         while chain[first] != chain[i] or seconds[first] < seconds[i] - _STEADY_TIME:
             first += 1
@@ -178,7 +178,7 @@ def _running_median(
         while last < n and chain[last] == chain[i] and seconds[last] <= seconds[i] + _STEADY_TIME:
             last += 1
         stride = (last - first - 1) // _STEADY_FIXES + 1
-        # Counted from the fix itself, so that both sides weigh alike.
+        # Fixes are counted from this fix, so that both sides have the same weight.
         begin = i - (i - first) // stride * stride
         for column in range(2):
             result[i, column] = np.median(values[begin:last:stride, column])

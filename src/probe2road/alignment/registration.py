@@ -1,4 +1,4 @@
-"""Registration: each drive shifted until what it saw lies on what the other drives saw.
+"""Registration: each drive shifted until its sightings lie on those of the other drives.
 
 Strategy
 --------
@@ -36,12 +36,12 @@ from probe2road.alignment.profiles import (
 
 __all__ = ["Chains", "DriveEvidence", "register"]
 
-_PASSES = 2  # how often each chain is placed, where none is yet
+_PASSES = 2  # how often each chain is placed on a map that starts empty
 
 
 @dataclass(frozen=True)
 class DriveEvidence:
-    """What keyframes saw, in coordinates of places: o observations, in the order of the keyframes."""
+    """The o observations of keyframes, in coordinates of places and in the order of the keyframes."""
 
     keyframe: NDArray[np.int64]  # (o,)
     place: NDArray[np.int64]  # (o,)
@@ -51,15 +51,15 @@ class DriveEvidence:
 
 @dataclass(frozen=True)
 class Chains:
-    """C chains of keyframes, and how they are placed."""
+    """C chains of keyframes, and the order in which they are placed."""
 
     starts: NDArray[np.int64]  # (c + 1,) keyframe at which each starts, then their number
     order: NDArray[np.int64]  # (c,) the chains in the order in which they are placed
-    held: NDArray[np.bool_]  # (c,) chains that stay where they are, and come before all others
+    held: NDArray[np.bool_]  # (c,) chains that do not move; they are placed before all others
 
     @property
     def placing(self) -> NDArray[np.int64]:
-        """The order, those that are held first."""
+        """Return the order in which chains are placed; those that do not move come first."""
         held = self.held[self.order]
         return np.concatenate([self.order[held], self.order[~held]])
 
@@ -130,7 +130,7 @@ def _place_chains(
     search: ShiftSearch,
     settled: bool,
 ) -> NDArray[np.float64]:
-    """Place the chains, and leave them on the map: the shift of each keyframe (m), shape ``(k,)``."""
+    """Place the chains on the map and leave them there: return the shift of each keyframe (m), shape ``(k,)``."""
     shift = np.zeros(len(track.home))
     placed = np.full(len(starts) - 1, settled)
     if settled:
@@ -166,7 +166,7 @@ def _add_chain(
     profiles: Profiles,
     search: ShiftSearch,
 ) -> None:
-    """Put a chain on the map where its shift says, or take it off with a negative sign."""
+    """Add a chain to the map at its shift, or remove it if ``sign`` is negative."""
     for k in range(begin, end):
         place = track.home[k]
         if place >= 0:

@@ -1,4 +1,4 @@
-"""What alignment did to a fleet: which drives, by how much, and how far apart they were and are."""
+"""The report of an alignment: which drives were aligned, how far they moved, and how well they agree."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class AlignmentReport:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The figures that fit on a line, for logs and JSON."""
+        """Return the figures that fit on one line, for logs and JSON."""
         status = self.drives["status"].value_counts()
         rejected = self.drives.loc[self.drives["status"] == "rejected", "reason"].value_counts()
         return {
@@ -78,12 +78,12 @@ class AlignmentReport:
         return f"AlignmentReport({figures['drives']} drives: {drives}; lines {apart})"
 
     def _repr_html_(self) -> str:
-        """Show the figures in a notebook, and no id."""
+        """Show figures in a notebook, without any ids."""
         return figures_table("AlignmentReport", self.summary)
 
 
 def make_report(fleet: Fleet, reasons: NDArray[np.str_], held: NDArray[np.bool_], moves: Moves) -> AlignmentReport:
-    """Work out the figures.
+    """Compute the report of an alignment.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def make_report(fleet: Fleet, reasons: NDArray[np.str_], held: NDArray[np.bool_]
 
 
 def write_report(report: AlignmentReport, folder: str | PathLike[str]) -> None:
-    """Write ``report.json``, ``drives.csv`` and ``residuals.csv`` into a folder, created where it does not exist."""
+    """Write ``report.json``, ``drives.csv`` and ``residuals.csv`` into a folder, which is created if it is missing."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_path(folder / "drives.csv") as temporary:
@@ -143,7 +143,7 @@ def draw_alignment(
     path
         The file.
     bounds
-        ``(left, bottom, right, top)`` in metres; the busiest square of 250 m where it is None.
+        ``(left, bottom, right, top)`` in metres; the busiest square of 250 m if it is None.
 
     Raises
     ------
@@ -171,7 +171,7 @@ def draw_alignment(
 
 
 def _busiest(fleet: Fleet) -> tuple[float, float, float, float]:
-    """Return the square of the plane that most headings pass through: an interchange, where there is one."""
+    """Return the square of the plane with the most different headings: an interchange, if there is one."""
     traces = fleet.traces
     column, row = ((traces[axis].to_numpy() // _WINDOW).astype(np.int64) for axis in "xy")
     heading = traces["heading"].to_numpy() if "heading" in traces else np.zeros(len(traces))

@@ -1,4 +1,4 @@
-"""Routes: which drives surely are on one road, so that their heights can be averaged before decks are told apart.
+"""Routes: drives that are certainly on one road, whose heights are averaged before decks are separated.
 
 Strategy
 --------
@@ -23,14 +23,14 @@ from probe2road.alignment.spines import OnSpines, Spines
 
 __all__ = ["route_heights", "routes", "split_decks"]
 
-_LEAST_GAIN = 0.65, 4.0  # log-likelihood by which two groups must explain heights better: for each drive, and in all
+_LEAST_GAIN = 0.65, 4.0  # gain in log-likelihood that two groups need over one: for each drive, and in total
 _LEAST_DRIVES = 3  # in the smaller group
 
 
 def route_heights(
     frames: Keyframes, on: OnSpines, spines: Spines, options: AlignOptions, *, held: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Bring the heights of drives on one route together.
+    """Move the heights of the drives on each route to their common mean.
 
     Parameters
     ----------
@@ -61,13 +61,13 @@ def route_heights(
 
 
 def _places(on: OnSpines, route: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Find the piece of a route, two cells long, that each keyframe is on: shape ``(k,)``, -1 where there is none."""
+    """Return the piece of a route, two cells long, that each keyframe is on: shape ``(k,)``, -1 for none."""
     _, place = np.unique(np.column_stack([on.cell // 2, route]), axis=0, return_inverse=True)
     return np.where(route >= 0, place.ravel(), -1)
 
 
 def routes(frames: Keyframes, on: OnSpines, spines: Spines) -> NDArray[np.int64]:
-    """Find the route of each keyframe: those on one spine that come from one spine and leave for one spine share it.
+    """Return the route of each keyframe: a route is one spine, with the same spine before and the same one after.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def routes(frames: Keyframes, on: OnSpines, spines: Spines) -> NDArray[np.int64]
 
 
 def _without_flickers(spine: NDArray[np.int64], chain: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Give a keyframe the spine of its neighbours where these agree and it does not."""
+    """Replace the spine of a keyframe by that of its two neighbours, if these have the same one."""
     before, after = np.roll(spine, 1), np.roll(spine, -1)
     same = (np.roll(chain, 1) == chain) & (np.roll(chain, -1) == chain)
     return np.where(same & (before == after), before, spine)
@@ -108,7 +108,7 @@ def split_decks(
     sigma: NDArray[np.float64],
     gate: float,
 ) -> NDArray[np.int64]:
-    """Split routes whose drives fall into two groups by height.
+    """Split routes whose drives form two groups by height.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def split_decks(
 
 
 def _threshold(off: NDArray[np.float64], sigma: NDArray[np.float64], gate: float) -> float:
-    """Height that divides values into two groups, infinite where one group explains them."""
+    """Return the height that separates values into two groups, infinity if one group explains them."""
     order = np.argsort(off)
     values, weight = off[order], 1.0 / sigma[order] ** 2
     if len(values) < 2 * _LEAST_DRIVES:

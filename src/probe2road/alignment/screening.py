@@ -1,4 +1,4 @@
-"""Which drives can be aligned at all: what is wrong with a drive is found before it can pull at others.
+"""Screening: which drives can be aligned at all, decided before a bad drive can displace others.
 
 Strategy: every check is a sum or a median over the rows of a drive, so that it is one pass of array code over the
 whole fleet. A check needs many rows to fail before it condemns a drive; single bad fixes are left to robust kernels.
@@ -19,20 +19,20 @@ __all__ = ["rows_of_points", "screen_drives"]
 logger = logging.getLogger(__name__)
 
 _SAME_TIME = 0.6  # s; a point belongs to the fix nearest in time, if that is no further away
-_LEAST_DRIVEN = 30.0  # m from end to end; a drive that moves less says nothing about a road
-_MOVED = 3.0  # m; over a shorter step noise decides the course
-_ROLLED = 1.0  # m; a shorter step may be a wait
-_JUMP = 150.0  # m beyond what the speed explains
+_LEAST_DRIVEN = 30.0  # m from end to end; a shorter drive shows no road
+_MOVED = 3.0  # m; the course of a shorter step is noise
+_ROLLED = 1.0  # m; in a shorter step, the vehicle may stand
+_JUMP = 150.0  # m by which a jump is longer than the speed explains
 _TOP_SPEED = 70.0  # m/s, where no speed is recorded
-_JUMPY = 0.1  # share of steps that jump, from which on two drives are mixed
-_COURSE = 40.0  # degrees between heading and course, in the median
-_CLOCK = 1.6  # factor between distance and speed times time
-_STRAY_POINTS = 0.5  # share of the points that no fix accounts for
-_FAR_POINTS = 100.0  # m from its fix; no camera sees so far
+_JUMPY = 0.1  # share of jumps in the steps, from which a trace is a mix of two drives
+_COURSE = 40.0  # degrees, largest median angle between heading and course
+_CLOCK = 1.6  # largest factor between distance and speed times time
+_STRAY_POINTS = 0.5  # largest share of points that belong to no fix
+_FAR_POINTS = 100.0  # m from a point to its fix; no camera sees so far
 
 
 def screen_drives(fleet: Fleet) -> NDArray[np.str_]:
-    """Say what is wrong with each drive.
+    """Return what is wrong with each drive.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def screen_drives(fleet: Fleet) -> NDArray[np.str_]:
 
 
 def rows_of_points(fleet: Fleet) -> NDArray[np.int64]:
-    """Return the row of the fix that each point was seen from: of its drive, nearest in time.
+    """Return the row of the fix that each point was seen from: the fix of the same drive that is nearest in time.
 
     Returns
     -------
@@ -113,7 +113,7 @@ def rows_of_points(fleet: Fleet) -> NDArray[np.int64]:
 
 
 def _jumps(step: NDArray[np.float64], interval: NDArray[np.float64], speed: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which steps are longer than any driving explains."""
+    """Tell which steps are longer than any vehicle can drive."""
     before = np.concatenate([speed[:1], speed[:-1]])
     fastest = np.where(np.isfinite(speed + before), 2.0 * np.maximum(speed, before), _TOP_SPEED)
     with np.errstate(invalid="ignore"):
@@ -123,7 +123,7 @@ def _jumps(step: NDArray[np.float64], interval: NDArray[np.float64], speed: NDAr
 def _clock_is_wrong(
     step: NDArray[np.float64], interval: NDArray[np.float64], speed: NDArray[np.float64], owner: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """Tell which drives cover another distance than their speeds and times give."""
+    """Tell which drives cover a distance that does not agree with their speeds and times."""
     before = np.concatenate([speed[:1], speed[:-1]])
     expected = (speed + before) / 2.0 * interval
     with np.errstate(invalid="ignore"):
@@ -141,7 +141,7 @@ def _course_is_wrong(
     step: NDArray[np.float64],
     owner: NDArray[np.int64],
 ) -> NDArray[np.bool_]:
-    """Tell which drives move in another direction than they head: mirrored or swapped axes."""
+    """Tell which drives move in a direction that does not agree with their headings: mirrored or swapped axes."""
     if "heading" not in traces:
         return np.zeros(owner[-1] + 1, bool)
     course = np.degrees(np.arctan2(dx, dy))
@@ -151,7 +151,7 @@ def _course_is_wrong(
 
 
 def _points_are_wrong(fleet: Fleet) -> NDArray[np.bool_]:
-    """Tell which drives have points, most of which were seen at no time and place of the drive."""
+    """Tell which drives have mostly points that do not fit any time or place of the drive."""
     if fleet.points.empty:
         return np.zeros(fleet.n_traces, bool)
     rows = rows_of_points(fleet)
@@ -175,5 +175,5 @@ def _sum(values: NDArray[np.bool_], owner: NDArray[np.int64], n: int) -> NDArray
 
 
 def _median(values: NDArray[np.float64], owner: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Median of the finite values of each drive; NaN where there are none."""
+    """Return the median of the finite values of each drive; NaN where there are none."""
     return pd.Series(values).groupby(owner).median().to_numpy()

@@ -1,4 +1,4 @@
-"""Spines: curves along the roads, taken from the drives themselves, that give every drive common coordinates.
+"""Spines: curves along the roads, made from the drives themselves, that give all drives common coordinates.
 
 Strategy
 --------
@@ -25,7 +25,7 @@ __all__ = ["CELL", "OnSpines", "Spines", "find_spines", "project"]
 
 CELL = 10.0  # m, length of the cells into which spines are divided
 _STATION = 4.0  # m between stations
-_OVERLAP = 40.0  # m, by which a spine reaches into what another covers
+_OVERLAP = 40.0  # m, by which a spine overlaps the area of another
 _SQUARE = 32.0  # m, side of the squares through which stations are found
 
 
@@ -43,15 +43,15 @@ class Spines:
 
     @property
     def n_cells(self) -> int:
-        """Number of cells."""
+        """Return the number of cells."""
         return len(self.cell_spine)
 
     def spine_of(self, cell: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Spine of each cell, -1 for a cell of -1: shape ``(n,)``."""
+        """Return the spine of each cell, -1 for a cell of -1: shape ``(n,)``."""
         return np.where(cell >= 0, self.cell_spine[np.maximum(cell, 0)], -1)
 
     def above(self, station: NDArray[np.int64], level: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far above their stations heights are, m, shape ``(n,)``; it means nothing where there is no station.
+        """Return how far above their stations heights are, m, shape ``(n,)``; meaningless where there is no station.
 
         Each spine lies as high as one drive said, so this changes by metres from one spine to the next.
         """
@@ -69,7 +69,7 @@ class OnSpines:
 
 
 def find_spines(frames: Keyframes, order: NDArray[np.int64], options: AlignOptions) -> Spines:
-    """Lay spines so that every keyframe is within reach of one.
+    """Choose spines so that every keyframe is within reach of one.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def find_spines(frames: Keyframes, order: NDArray[np.int64], options: AlignOptio
 
 
 def project(spines: Spines, pose: NDArray[np.float64], options: AlignOptions, *, reach: float = 25.0) -> OnSpines:
-    """Find positions on the spines.
+    """Return the coordinates of positions on the spines.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def project(spines: Spines, pose: NDArray[np.float64], options: AlignOptions, *,
     east, north, cos, sin = pose[:, 0] - x, pose[:, 1] - y, np.cos(theta), np.sin(theta)
     along = spines.along[near] + cos * east + sin * north
     cell = np.clip((along / CELL).astype(np.int64), 0, spines.n_cells - 1)
-    # Beyond the end of a spine its last cell goes on.
+    # Positions beyond the end of a spine belong to its last cell.
     own = spines.cell_spine[(spines.along[near] / CELL).astype(np.int64)]
     first = np.searchsorted(spines.cell_spine, own)
     last = np.searchsorted(spines.cell_spine, own, side="right") - 1
@@ -139,7 +139,7 @@ def project(spines: Spines, pose: NDArray[np.float64], options: AlignOptions, *,
 
 
 def _stations(frames: Keyframes) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Poses every few metres along every chain (m, 3), their heights (m,), where each chain starts (chains + 1,)."""
+    """Return poses every few metres on all chains (m, 3), their heights (m,), and chain starts (chains + 1,)."""
     starts = frames.starts
     first, last = starts[:-1], starts[1:] - 1
     length = frames.distance[last] - frames.distance[first]
@@ -147,7 +147,7 @@ def _stations(frames: Keyframes) -> tuple[NDArray[np.float64], NDArray[np.float6
     offsets = np.concatenate([[0], np.cumsum(count)])
     chain = np.repeat(np.arange(len(count)), count)
     ahead = (np.arange(offsets[-1]) - offsets[chain]) * _STATION
-    # A chain begins where the one before ends: a metre between them keeps the abscissa of all chains ascending.
+    # A chain begins where the one before ends: a gap of a metre keeps the distance of all chains ascending.
     abscissa = frames.distance + np.cumsum(frames.first)
     at = abscissa[first][chain] + ahead
     x, y = (np.interp(at, abscissa, frames.pose[:, axis]) for axis in (0, 1))
@@ -167,7 +167,7 @@ def _cover(
     reach: float,
     heading_gate: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Choose the stations: rows of the path, their spines, and the squares they are found through."""
+    """Choose the stations: return rows of the path, their spines, and the squares that serve to find them."""
     squares = np.full(shape, -1, np.int64)
     kept = np.empty(len(path) + 1, np.int64)
     spine = np.empty(len(path) + 1, np.int64)
@@ -207,7 +207,7 @@ def _nearest(
     gate: float,
     reach: float,
 ) -> NDArray[np.int64]:
-    """Nearest station of like heading within reach of each position, -1 where there is none: shape ``(n,)``."""
+    """Return the nearest station with a similar heading within reach of each position, -1 for none: shape ``(n,)``."""
     found = np.full(len(pose), -1, np.int64)
     rows, cols = squares.shape
     for i in range(len(pose)):

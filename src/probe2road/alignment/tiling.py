@@ -1,4 +1,4 @@
-"""Areas of a large fleet, aligned one by one and joined without seams.
+"""Tiles of a large fleet, aligned one by one and joined without seams.
 
 Strategy
 --------
@@ -33,7 +33,7 @@ __all__ = ["Moves", "Tile", "align_tiles", "find_tiles", "moved_fleet"]
 
 logger = logging.getLogger(__name__)
 
-_LEAST_WEIGHT = 1e-3  # at the border of a tile that has no neighbour there
+_LEAST_WEIGHT = 1e-3  # weight at the border of a tile
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,14 @@ class Tile:
 
     @property
     def box(self) -> tuple[float, float, float, float]:
-        """The square with its margin."""
+        """Return the square with its margin."""
         left, bottom, right, top = self.core
         return left - self.margin, bottom - self.margin, right + self.margin, top + self.margin
 
 
 @dataclass(frozen=True)
 class Moves:
-    """What alignment does to a fleet of n fixes.
+    """The corrections that alignment applies to the n fixes of a fleet.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Moves:
 
 
 class TileMoves(NamedTuple):
-    """What one tile gives: moves of the n fixes in it, and residuals of the m points that its keyframes saw."""
+    """The result of one tile: moves of the n fixes in it, and residuals of the m points that its keyframes saw."""
 
     row: NDArray[np.int64]  # (n,) of the fixes in the fleet
     shift: NDArray[np.float64]  # (n, 4) as in `Moves`
@@ -97,7 +97,7 @@ def find_tiles(fleet: Fleet, options: AlignOptions, *, touched: NDArray[np.bool_
     """
     xy = fleet.traces[["x", "y"]].to_numpy(np.float64)
     xy = xy if touched is None else xy[touched]
-    # Every fix matters to the tiles whose margin it is in, too.
+    # A fix also belongs to the tiles whose margin it is in.
     corners = [xy + np.array(offset) * options.margin for offset in ((-1, -1), (-1, 1), (1, -1), (1, 1))]
     found = np.unique(np.floor(np.concatenate(corners) / options.tile).astype(np.int64), axis=0)
     if touched is None:
@@ -165,7 +165,7 @@ def align_tiles(
 
 
 def moved_fleet(fleet: Fleet, shift: NDArray[np.float64]) -> Fleet:
-    """Return a fleet with its poses moved, and its points moved rigidly with the poses that they were seen from.
+    """Return a fleet with its poses moved; each point moves rigidly with the pose that it was seen from.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def _results(
     workspace: Workspace,
     workers: int,
 ) -> Iterator[tuple[Tile, TileMoves]]:
-    """Yield what every tile gave: those that an earlier run kept, then the others as they are made."""
+    """Yield the result of every tile: first those kept by an earlier run, then new ones as they are made."""
     missing = []
     for tile in tiles:
         kept = workspace.read_arrays(ALIGNED_TILE, tile.name)
@@ -238,14 +238,14 @@ def _results(
 
 @dataclass(frozen=True)
 class _Squares:
-    """Rows by the square of the plane that they are in, so that a tile is cut without a pass over all of them."""
+    """Rows sorted by squares of the plane, so that a tile can be cut without a pass over all rows."""
 
     size: float  # m
     rows: dict[tuple[int, int], NDArray[np.int64]]
 
     @classmethod
     def of(cls, xy: NDArray[np.float64], rows: NDArray[np.int64], size: float) -> _Squares:
-        """Sort some rows of positions, shape ``(n, 2)``."""
+        """Return the index of squares for positions, shape ``(n, 2)``."""
         column, row = np.floor(xy[rows] / size).astype(np.int64).T
         order = np.lexsort((row, column))
         ends = np.flatnonzero((np.diff(column[order]) != 0) | (np.diff(row[order]) != 0)) + 1
@@ -253,7 +253,7 @@ class _Squares:
         return cls(size, {(int(column[part[0]]), int(row[part[0]])): rows[part] for part in parts})
 
     def touching(self, box: tuple[float, float, float, float]) -> NDArray[np.int64]:
-        """Rows of all squares that a box reaches into, ascending."""
+        """Return the rows of all squares that a box overlaps, ascending."""
         left, bottom, right, top = (int(np.floor(edge / self.size)) for edge in box)
         places = ((column, row) for column in range(left, right + 1) for row in range(bottom, top + 1))
         parts = [self.rows[place] for place in places if place in self.rows]
@@ -267,7 +267,7 @@ def _cut(
     squares: tuple[_Squares, _Squares],
     tile: Tile,
 ) -> tuple[Fleet, NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the part of a fleet inside a tile and its margin, the rows it has, and which of its drives are held.
+    """Return the part of a fleet inside a tile and its margin, its rows, and which of its drives do not move.
 
     The squares are those of the usable fixes and of the points seen from them.
     """
@@ -303,7 +303,7 @@ def _align_tile(
 
 
 def _fix_moves(part: Fleet, area: AlignedArea) -> NDArray[np.float64]:
-    """Move of every fix (n, 4), between those of the keyframes around it."""
+    """Interpolate the move of every fix (n, 4) from the moves of the keyframes around it."""
     frames = area.frames
     n = len(part.traces)
     before = np.searchsorted(frames.row, np.arange(n), side="right") - 1

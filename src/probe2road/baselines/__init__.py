@@ -1,4 +1,4 @@
-"""The methods that the paper compares itself with, as functions from fleet data to a road graph."""
+"""The baselines of the paper: the methods that it compares itself with, from fleet data to a road graph."""
 
 from pkgutil import iter_modules
 

@@ -1,4 +1,4 @@
-"""Skeleton to lines of pixels by the fringe method of Biagioni and DeepMG.
+"""From a skeleton to lines of pixels, by the fringe method of Biagioni and DeepMG.
 
 Strategy
 --------
@@ -101,7 +101,7 @@ def trace_fringe(skeleton: NDArray[Any], *, min_length: float = 0.0) -> PixelGra
 
 
 def _rounded_means(node: NDArray[np.int64], values: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the mean over the pixels of every node, rounded down."""
+    """Return the mean position of the pixels of every node, rounded down."""
     known = node >= 0
     total = np.bincount(node[known], values[known])
     return np.asarray(np.floor(total / np.bincount(node[known])))
@@ -117,7 +117,7 @@ def _long_enough(
     col: NDArray[np.float64],
     min_length: float,
 ) -> PixelGraph:
-    """Drop short lines, and then nodes without lines."""
+    """Drop short lines, and then the nodes without lines."""
     line = np.repeat(np.arange(len(sizes)), sizes)
     step = np.hypot(np.diff(row, prepend=0), np.diff(col, prepend=0))
     step[np.cumsum(sizes) - sizes] = 0.0
@@ -137,7 +137,7 @@ def _long_enough(
 
 @njit(cache=True)
 def _branches(links: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Count the groups of fringe pixels around every pixel: what is two steps away and in the ring."""
+    """Count the groups of fringe pixels around every pixel: pixels at two steps' distance, connected in the ring."""
     branches = np.zeros(len(links), np.int64)
     fringe = np.zeros(16, np.bool_)
     for pixel in range(len(links)):
@@ -158,7 +158,7 @@ def _branches(links: NDArray[np.int32]) -> NDArray[np.int64]:
 
 @njit(cache=True)
 def _node_of_pixel(links: NDArray[np.int32], at_node: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the node of every pixel, -1 for none: node pixels that touch share one, in the order of their first."""
+    """Return the node of every pixel, -1 for none; touching node pixels form one node, numbered by the first pixel."""
     node = np.full(len(links), -1, np.int64)
     count = 0
     for first in range(len(links)):
@@ -180,7 +180,7 @@ def _node_of_pixel(links: NDArray[np.int32], at_node: NDArray[np.bool_]) -> NDAr
 def _burn(
     links: NDArray[np.int32], line: NDArray[np.bool_], node: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Burn all lines beside nodes: start and stop nodes, numbers of pixels, and the pixels from start to stop."""
+    """Follow all lines beside nodes: return start and stop nodes, numbers of pixels, and the pixels between them."""
     unburnt, parent = line.copy(), np.full(len(links), -1, np.int64)
     start, stop, sizes = [0 for _ in range(0)], [0 for _ in range(0)], [0 for _ in range(0)]
     path = [0 for _ in range(0)]
@@ -214,7 +214,7 @@ def _fire(
     first: int,
     origin: int,
 ) -> tuple[int, int]:
-    """Burn from a line pixel, depth first, until another node is beside the fire.
+    """Follow a line from a pixel, depth first, until another node is reached.
 
     Returns the pixel there and the node, both -1 where the fire goes out before; parents lead back to the first pixel.
     """

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 @checked
 class KdeOptions:
-    """The parameters, of which the paper publishes none.
+    """The parameters of the method; the paper publishes none of them.
 
     The three that make the density were chosen by ``experiments/fit_kde.py``.
     """
@@ -54,19 +54,19 @@ def build_kde(
     workspace: str | Path | None = None,
     progress: Progress | None = None,
 ) -> RoadGraph:
-    """Build a road graph with three-dimensional kernel density estimation; only traces are used.
+    """Build a road graph by kernel density estimation in three dimensions, from traces only.
 
     Parameters
     ----------
     fleet
         From `probe2road.read_fleet`. Fixes without altitude are left out, unless none has one.
     options
-        The defaults where it is None.
+        None takes the defaults.
     workspace
         Folder for what every stage makes. A run on the same fleet with the same options takes the result from it.
-        Nothing is written where it is None.
+        Nothing is written if it is None.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------
@@ -102,7 +102,7 @@ def build_kde(
 
 
 def _built(fleet: Fleet, grid: Grid, options: KdeOptions, work: Workspace, report: Progress) -> RoadGraph:
-    """Build the graph of a fleet from its density in space."""
+    """Build the graph of a fleet from its density in three dimensions."""
     report("density", 0, 1)
     counts = count_voxels(fleet, grid, height=options.height, gaps=options.gaps)
     pillars = dense_pillars(

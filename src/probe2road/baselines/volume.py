@@ -1,4 +1,4 @@
-"""Traces to a volume: voxel counts, their smoothed density, and the voxels above a threshold, as pillars.
+"""From traces to a volume: voxel counts, their smoothed density, and the voxels above a threshold, as pillars.
 
 Strategy
 --------
@@ -33,7 +33,7 @@ _BITS = 62  # layers of a pillar; one more is left free above and below
 
 @dataclass(frozen=True)
 class VoxelCounts:
-    """How many traces traversed each voxel of a grid that has layers; K voxels that are not empty.
+    """How many traces cross each voxel of a grid with layers; only the K voxels that are not empty.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class VoxelCounts:
 
 @dataclass(frozen=True)
 class Pillars:
-    """Voxels of a volume by their place seen from above, P places.
+    """The voxels of a volume, grouped by their P places in plan.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class Pillars:
 
 
 def count_voxels(fleet: Fleet, grid: Grid, *, height: float, gaps: TraceGaps | None = None) -> VoxelCounts:
-    """Count how often traces traverse each voxel.
+    """Count how often traces cross each voxel.
 
     A trace counts one in every voxel that it traverses, the voxel that two of its segments share once. Fixes without
     altitude are left out, unless none has one: then all are at 0.
@@ -157,7 +157,7 @@ def dense_pillars(counts: VoxelCounts, *, sigma: float, sigma_vertical: float, t
 
 
 def pillars_from_voxels(row: NDArray[np.int64], col: NDArray[np.int64], layer: NDArray[np.int64]) -> Pillars:
-    """Gather voxels, each given once, in any order.
+    """Group voxels by place; each voxel is given once, in any order.
 
     Examples
     --------
@@ -180,7 +180,7 @@ def pillars_from_voxels(row: NDArray[np.int64], col: NDArray[np.int64], layer: N
 
 
 def _blocks(counts: VoxelCounts, halo: int, margin: int) -> Iterator[tuple[Window, int, NDArray[np.float32]]]:
-    """Yield windows with their counts, shape ``(rows, cols, layers)`` with a halo in plan, and the lowest layer.
+    """Yield windows with their counts, shape ``(rows, cols, layers)`` with a halo in plan, and their lowest layer.
 
     The layers are those with counts, and a margin on either side. Windows without counts in them are skipped.
     """
@@ -211,7 +211,7 @@ def _traversed(
     cols: int,
     layers: int,
 ) -> NDArray[np.int64]:
-    """List the keys of all voxels that segments traverse, one step along the longest axis at a time."""
+    """List the keys of all voxels that segments cross, with one step at a time along the longest axis."""
     total = 0
     for fix in range(len(row)):
         total += 1 if breaks[fix] else _steps(row, col, layer, fix)
@@ -233,6 +233,6 @@ def _traversed(
 
 @njit(cache=True)
 def _steps(row: NDArray[np.int64], col: NDArray[np.int64], layer: NDArray[np.int64], fix: int) -> int:
-    """Count the voxels from one fix to the next, the first left out."""
+    """Count the voxels from one fix to the next, without the first."""
     step = max(abs(row[fix] - row[fix - 1]), abs(col[fix] - col[fix - 1]))
     return max(step, abs(layer[fix] - layer[fix - 1]))

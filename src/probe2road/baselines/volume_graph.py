@@ -1,4 +1,4 @@
-"""Lines of single voxels to a road graph in three dimensions.
+"""From lines of single voxels to a road graph in three dimensions.
 
 Strategy
 --------
@@ -134,7 +134,7 @@ def _parts(step: _Step) -> list[_Step]:
 
 
 def _are_in(key: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Say which numbers are among sorted ones."""
+    """Tell which numbers are in a sorted array."""
     place = np.searchsorted(key, wanted)
     return (place < len(key)) & (key[np.minimum(place, len(key) - 1)] == wanted)
 
@@ -142,7 +142,7 @@ def _are_in(key: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.boo
 def _joined_junctions(
     one: NDArray[np.int64], other: NDArray[np.int64], xyz: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Join junction voxels that are linked: the node of every voxel, and the nodes' mean positions."""
+    """Join linked junction voxels: return the node of every voxel, and the mean position of every node."""
     count = len(xyz)
     junction = np.bincount(np.concatenate([one, other]), minlength=count) > 2
     both = junction[one] & junction[other]

@@ -1,4 +1,4 @@
-"""Volume to lines of single voxels: the thinning of Lee, Kashyap and Chu on pillars.
+"""From a volume to lines of single voxels: the thinning of Lee, Kashyap and Chu on pillars.
 
 Strategy
 --------
@@ -77,7 +77,7 @@ def thin_volume(pillars: Pillars, *, guarded: bool = True) -> Pillars:
 
 
 def _adjacency() -> NDArray[np.int64]:
-    """Return, for every place of a neighbourhood, the places that touch it, as bits; the centre touches none."""
+    """Return, for every place of a neighbourhood, the adjacent places as bits; the centre has none."""
     place = np.indices((3, 3, 3)).reshape(3, 27).T
     touches = (np.abs(place[:, None] - place[None]).max(axis=2) == 1).astype(np.int64)
     touches[_CENTRE] = 0
@@ -105,7 +105,7 @@ def _shared_cells() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 @njit(cache=True)
 def _beside(row: NDArray[np.int64], col: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Find the pillars at the nine places around and at every pillar, row by row; -1 where there is none."""
+    """Return the pillars at the nine places at and around every pillar, row by row; -1 for none."""
     n_pillars = len(row)
     beside = np.full((n_pillars, 9), -1, np.int32)
     for step in range(-1, 2):
@@ -161,7 +161,7 @@ def _thin(
 
 @njit(cache=True, inline="always")
 def _shifted(bits: np.uint64, by: int) -> np.uint64:
-    """Move bits up by so many places, or down where that is negative."""
+    """Shift bits up, or down if the number of places is negative."""
     if by >= 64 or by <= -64:
         return np.uint64(0)
     return bits << np.uint64(by) if by >= 0 else bits >> np.uint64(-by)
@@ -171,7 +171,7 @@ def _shifted(bits: np.uint64, by: int) -> np.uint64:
 def _bare(
     bits: NDArray[np.uint64], base: NDArray[np.int64], beside: NDArray[np.int32], pillar: int, side: NDArray[np.int64]
 ) -> np.uint64:
-    """Return the voxels of a pillar that have none beside them on one side."""
+    """Return the voxels of a pillar without a neighbour on one side."""
     own = bits[pillar]
     other = beside[pillar, 3 * (side[0] + 1) + side[1] + 1]
     if other < 0:
@@ -181,7 +181,7 @@ def _bare(
 
 @njit(cache=True)
 def _lowest(bits: np.uint64) -> int:
-    """Return the number of the lowest bit that is set."""
+    """Return the position of the lowest set bit."""
     place = 0
     while not (bits >> np.uint64(place)) & np.uint64(1):
         place += 1
@@ -192,7 +192,7 @@ def _lowest(bits: np.uint64) -> int:
 def _around(
     bits: NDArray[np.uint64], base: NDArray[np.int64], beside: NDArray[np.int32], pillar: int, place: int
 ) -> int:
-    """Gather the neighbourhood of a voxel, without the voxel itself."""
+    """Return the neighbourhood of a voxel as bits, without the voxel itself."""
     code = 0
     for k in range(9):
         other = beside[pillar, k]
@@ -204,7 +204,7 @@ def _around(
 
 @njit(cache=True)
 def _removable(around: int, adjacency: NDArray[np.int64], cells: NDArray[np.int64], signs: NDArray[np.int64]) -> bool:
-    """Say whether a voxel is no end of a line, and can go without changing the topology around it."""
+    """Tell whether a voxel is not the end of a line, and can be removed without changing the topology around it."""
     if around & (around - 1) == 0:  # one neighbour, or none
         return False
     change = -1
@@ -216,7 +216,7 @@ def _removable(around: int, adjacency: NDArray[np.int64], cells: NDArray[np.int6
 
 @njit(cache=True)
 def _connected(around: int, adjacency: NDArray[np.int64]) -> bool:
-    """Say whether the neighbours of a voxel are one part without it."""
+    """Tell whether the neighbours of a voxel stay connected without it."""
     reached = around & -around
     frontier = reached
     while frontier:

@@ -1,4 +1,4 @@
-"""The open benchmark: data sets on real road networks with known truth, and the paper's tables made on them."""
+"""The open benchmark: data sets on real road networks with known truth, and the paper's tables made from them."""
 
 from pkgutil import iter_modules
 

@@ -20,6 +20,7 @@ from probe2road.cli.reading import (
     fleet_options,
     four_numbers,
     graph_options,
+    read_drives,
     read_roads,
     reference_options,
     spoken,
@@ -70,7 +71,7 @@ def _common(
 
 
 @app.command()
-@takes(fleet_format=fleet_options)
+@takes(fleet_format=fleet_options, without=["traces_layer"])
 def build(
     traces: Annotated[list[Path], typer.Argument(help="Files or folders: Parquet, GeoParquet, CSV, GPX.")],
     output: Annotated[
@@ -133,7 +134,7 @@ def build(
 
 
 @app.command()
-@takes(fleet_format=fleet_options)
+@takes(fleet_format=fleet_options, without=["traces_layer"])
 def align(
     traces: Annotated[list[Path], typer.Argument(help="Raw fleet data: files or folders.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file for the aligned traces.")],
@@ -181,7 +182,7 @@ def align(
 
 
 @app.command()
-@takes(fleet_format=fleet_options, graph_format=graph_options, without=["point_columns"])
+@takes(fleet_format=fleet_options, graph_format=graph_options, without=["point_columns", "layer"])
 def match(
     traces: Annotated[Path, typer.Argument(help="Fleet data: a file or a folder.")],
     graph: Annotated[Path, typer.Argument(help="Road graph, in any format that build writes, or OSM.")],
@@ -199,7 +200,6 @@ def match(
     config: Annotated[Path | None, typer.Option(help="TOML file with matching options, and how to read.")] = None,
 ) -> None:
     """Match traces to the edges of a road graph."""
-    from probe2road.io.fleet_reader import read_fleet
     from probe2road.io.graph_files import graph_format as format_of_graph
     from probe2road.io.graph_files import write_graph
     from probe2road.io.table_writer import GEO_SUFFIXES, require_table_suffix, write_table
@@ -220,7 +220,7 @@ def match(
     options = options_from_table(table, MatchOptions, where=config)
     options = replace(options, profile=profile) if profile else options
     network = read_roads(graph, graph_format, format=roads_format, target_crs=format.target_crs)
-    fleet = read_fleet(traces, format=format, target_crs=network.crs)
+    fleet = read_drives(traces, format=format, target_crs=network.crs)
     matches = match_fleet(network, fleet, options=options)
     placed = output.suffix.lower() in GEO_SUFFIXES
     write_table(matched_points(matches, network) if placed else matches.fixes, output, layer="matches")
@@ -270,7 +270,11 @@ def evaluate(
 
 
 @app.command()
-@takes(fleet_format=fleet_options, graph_format=graph_options, without=["point_columns", "graph_crs"])
+@takes(
+    fleet_format=fleet_options,
+    graph_format=graph_options,
+    without=["point_columns", "graph_crs", "graph_layer", "traces_layer"],
+)
 def info(
     file: Annotated[Path, typer.Argument(help="Fleet data or a road graph.")],
     fleet_format: Said[FleetFormat],
@@ -279,13 +283,15 @@ def info(
     """Describe fleet data or a road graph in figures."""
     from probe2road.io.describe import describe_file
 
-    format = chosen_format(fleet_format)  # there is one file: its CRS is said in one way, whatever it holds
-    roads_format = replace(chosen_format(graph_format), crs=format.crs, target_crs=format.target_crs)
+    format = chosen_format(fleet_format)  # there is one file: its CRS and layer are said in one way, whatever it holds
+    roads_format = replace(
+        chosen_format(graph_format), crs=format.crs, target_crs=format.target_crs, layer=format.layer
+    )
     typer.echo(json.dumps(describe_file(file, format=format, graph_format=roads_format), indent=1))
 
 
 @app.command()
-@takes(fleet_format=fleet_options, graph_format=graph_options, reference_format=reference_options)
+@takes(fleet_format=fleet_options, graph_format=graph_options, reference_format=reference_options, without=["layer"])
 def view(
     graph: Annotated[Path, typer.Argument(help="Road graph.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="HTML file, or PNG.")],
@@ -302,13 +308,12 @@ def view(
     """Draw a road graph over its traces: one HTML page that needs no network, or a picture."""
     from probe2road.draw.view import require_drawable
     from probe2road.draw.view import view as draw
-    from probe2road.io.fleet_reader import read_fleet
 
     require_drawable(output)
     _require_places(output)
     format = chosen_format(fleet_format)
     roads = read_roads(graph, graph_format, target_crs=format.target_crs)
-    fleet = read_fleet(traces, points, format=format, target_crs=roads.crs) if traces else None
+    fleet = read_drives(traces, points, format=format, target_crs=roads.crs) if traces else None
     compared = read_roads(reference, reference_format) if reference else None
     draw(roads, output, fleet=fleet, reference=compared, title=title or graph.name, min_drives=min_drives)
 
@@ -380,12 +385,12 @@ def train(
 
     An interrupted run goes on where it stopped when it is started again. Needs the extra 'train'.
     """
+    _require_folders(output)
     from probe2road.training.config import load_config
     from probe2road.training.finish import export_best
     from probe2road.training.loop import is_first, use_threads
     from probe2road.training.loop import train as run_training
 
-    _require_folders(output)
     chosen = load_config(config)
     if threads is not None:
         use_threads(threads)
@@ -400,7 +405,7 @@ def train(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line; an error of ours is one message and exit code 2, a result with nothing in it code 3."""
+    """Run the command line; an error of ours gives one message and exit code 2, an empty result exit code 3."""
     # How much to say is said to the program, but may stand anywhere.
     arguments = sorted(sys.argv[1:] if arguments is None else arguments, key=lambda word: word not in _VOLUME)
     try:
@@ -416,7 +421,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _require_places(*outputs: Path | None) -> None:
-    """Refuse files that cannot be written where they are to go, before any work, and two outputs of one name."""
+    """Refuse output paths that cannot be written, and two outputs of one name, before any work."""
     from probe2road.io.atomic import require_place
 
     named = [path for path in outputs if path is not None]
@@ -428,7 +433,7 @@ def _require_places(*outputs: Path | None) -> None:
 
 
 def _require_folders(*outputs: Path | None) -> None:
-    """Refuse a file where a folder is to go; one that is not there is created when it is written."""
+    """Refuse a file in the place of an output folder; a missing folder is created when it is written."""
     for path in outputs:
         if path is not None and path.exists() and not path.is_dir():
             raise OutputError("is a file, and a folder would be written", where=path, fix="choose another name")

@@ -1,4 +1,4 @@
-"""How a user says on the command line what files look like: options declared once, shared by all verbs that read.
+"""Options of the command line that describe input files: declared once, shared by all commands that read.
 
 A group of options is a function: its parameters are the options, and it returns what was `Said`. `takes` puts the
 options of a group in the place of one parameter of a verb, so that the help of the verb shows them and the verb gets
@@ -23,6 +23,7 @@ import typer
 from probe2road.errors import OptionError, Probe2RoadError
 
 if TYPE_CHECKING:
+    from probe2road.fleet.contract import Fleet
     from probe2road.graph.roadgraph import RoadGraph
     from probe2road.io.formats import FleetFormat, GraphFormat
 
@@ -33,6 +34,7 @@ __all__ = [
     "fleet_options",
     "four_numbers",
     "graph_options",
+    "read_drives",
     "read_roads",
     "reference_options",
     "spoken",
@@ -50,6 +52,8 @@ FLAGS: Mapping[str, str] = {
     "bbox": "--bbox",
     "delimiter": "--delimiter",
     "header": "--no-header",
+    "time_format": "--time-format",
+    "interval": "--interval",
     "invalid": "--invalid",
     "max_accuracy": "--max-accuracy",
     "max_speed": "--max-speed",
@@ -72,7 +76,7 @@ _FLEET, _GRAPH, _REFERENCE = "How to read the fleet data", "How to read the grap
 
 @dataclass(frozen=True)
 class Said(Generic[Format]):
-    """What the command line says of the files of a fleet, or of a graph."""
+    """The description of the files of a fleet, or of a graph, on the command line."""
 
     kind: type[Format]
     table: str  # the table of a TOML file that says the rest
@@ -111,6 +115,20 @@ def fleet_options(
             "--no-header", help="Text tables have no line of names: columns are 0, 1, 2.", rich_help_panel=_FLEET
         ),
     ] = False,
+    time_format: Annotated[
+        str | None,
+        typer.Option(help="How times are written, as for strptime: '%d.%m.%Y %H:%M:%S'.", rich_help_panel=_FLEET),
+    ] = None,
+    interval: Annotated[
+        float | None,
+        typer.Option(help="Seconds between the positions of a line that has a start time.", rich_help_panel=_FLEET),
+    ] = None,
+    layer: Annotated[
+        str | None, typer.Option(help="Layer of the fixes, in a file of several.", rich_help_panel=_FLEET)
+    ] = None,
+    traces_layer: Annotated[
+        str | None, typer.Option(help="Layer of the fixes, in a file of several.", rich_help_panel=_FLEET)
+    ] = None,
     trim_ends: Annotated[
         float | None, typer.Option(help="Metres to leave out at both ends of every trace.", rich_help_panel=_FLEET)
     ] = None,
@@ -130,7 +148,7 @@ def fleet_options(
         typer.Option(help="Leave out fixes faster than this from their neighbours, m/s.", rich_help_panel=_FLEET),
     ] = None,
 ) -> Said[FleetFormat]:
-    """Return what is said of the files of a fleet."""
+    """Return what is said of the files of a fleet; verbs that take a graph, too, call the layer ``--traces-layer``."""
     from probe2road.io.formats import FleetFormat
 
     fields = {
@@ -141,6 +159,9 @@ def fleet_options(
         "bbox": four_numbers(bbox, "--bbox") if bbox else None,
         "delimiter": delimiter,
         "header": False if no_header else None,
+        "time_format": time_format,
+        "interval": interval,
+        "layer": layer or traces_layer,
         "trim_ends": trim_ends,
         "invalid": invalid,
         "max_accuracy": max_accuracy,
@@ -150,8 +171,8 @@ def fleet_options(
 
 
 def graph_options(
-    layer: Annotated[
-        str | None, typer.Option(help="Layer of the roads, in a file of several.", rich_help_panel=_GRAPH)
+    graph_layer: Annotated[
+        str | None, typer.Option("--layer", help="Layer of the roads, in a file of several.", rich_help_panel=_GRAPH)
     ] = None,
     graph_crs: Annotated[
         str | None,
@@ -166,11 +187,11 @@ def graph_options(
         ),
     ] = False,
 ) -> Said[GraphFormat]:
-    """Return what is said of the file of a graph."""
+    """Return the description of the file of a graph."""
     from probe2road.io.formats import GraphFormat
 
     flags = {"layer": "--layer", "crs": "--graph-crs", "inner_junctions": "--no-inner-junctions"}
-    fields = {"layer": layer, "crs": graph_crs, "inner_junctions": False if no_inner_junctions else None}
+    fields = {"layer": graph_layer, "crs": graph_crs, "inner_junctions": False if no_inner_junctions else None}
     return Said(GraphFormat, "graph_format", fields, flags)
 
 
@@ -191,7 +212,7 @@ def reference_options(
         ),
     ] = False,
 ) -> Said[GraphFormat]:
-    """Return what is said of the file of a reference graph."""
+    """Return the description of the file of a reference graph."""
     from probe2road.io.formats import GraphFormat
 
     flags = {
@@ -207,7 +228,7 @@ def reference_options(
 def takes(
     *, without: Collection[str] = (), **groups: Callable[..., Said[Any]]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a verb options in groups: typer sees all options, the verb gets one object for each group.
+    """Give a command options in groups: typer sees all options, the command gets one object for each group.
 
     Parameters
     ----------
@@ -222,8 +243,8 @@ def takes(
     ... def show(path: str, graph: Said) -> None:
     ...     print(path, graph.fields["layer"])
     >>> list(signature(show).parameters)
-    ['path', 'layer', 'no_inner_junctions']
-    >>> show(path="roads.gpkg", layer="streets")
+    ['path', 'graph_layer', 'no_inner_junctions']
+    >>> show(path="roads.gpkg", graph_layer="streets")
     roads.gpkg streets
     """
 
@@ -252,7 +273,7 @@ def takes(
 
 
 def chosen_format(said: Said[Format], config: dict[str, Any] | None = None, *, where: object = None) -> Format:
-    """Return the format of a TOML file, with what the command line says in the place of its fields.
+    """Return the format from a TOML file, with fields replaced by those from the command line.
 
     Parameters
     ----------
@@ -280,7 +301,7 @@ def chosen_format(said: Said[Format], config: dict[str, Any] | None = None, *, w
 def read_roads(
     path: Path, said: Said[GraphFormat], *, format: GraphFormat | None = None, target_crs: Any = None
 ) -> RoadGraph:
-    """Read a road graph; errors name the flags of this graph, of which a verb may take several.
+    """Read a road graph; errors name the options of this graph, because a command may read several graphs.
 
     Parameters
     ----------
@@ -303,8 +324,29 @@ def read_roads(
         raise
 
 
+def read_drives(traces: Path, points: Path | None = None, *, format: FleetFormat, target_crs: Any = None) -> Fleet:
+    """Read fleet data for a verb that takes a graph as well; errors name the flags of the fleet.
+
+    Parameters
+    ----------
+    traces, points
+        Files or folders.
+    format
+        What the command line and a TOML file say of them.
+    target_crs
+        Metric CRS to work in, in the place of the format's.
+    """
+    from probe2road.io.fleet_reader import read_fleet
+
+    try:
+        return read_fleet(traces, points, format=format, target_crs=target_crs)
+    except Probe2RoadError as error:
+        error.args = (spoken(str(error), {**FLAGS, "layer": "--traces-layer"}),)
+        raise
+
+
 def spoken(message: str, flags: Mapping[str, str] = FLAGS) -> str:
-    """Put the arguments in a message of the library into flags of the command line.
+    """Replace the names of arguments in a message of the library by options of the command line.
 
     Arguments stand in messages as a Python caller writes them. Other arguments, and what only looks like one, stay.
 
@@ -342,7 +384,7 @@ def four_numbers(text: str, option: str) -> tuple[float, float, float, float]:
 
 
 def _parameters(function: Callable[..., Any], *, unseen: Collection[str] = ()) -> list[Parameter]:
-    """Return the parameters of a function by keyword, annotations resolved but for those that typer does not see.
+    """Return the parameters of a function as keyword-only, with annotations resolved except those hidden from typer.
 
     Unseen ones, and what the function returns, have types that are not imported before a verb runs.
     """
@@ -365,7 +407,7 @@ def _column_map(text: str | None, option: str) -> dict[str, str] | None:
 
 
 def _word(value: Any) -> str:
-    """Write a value as a flag takes it, with the space before it; a flag that is a switch takes none."""
+    """Return a value in the form for an option, with a space before it; a switch has no value."""
     if isinstance(value, bool):
         return ""
     if isinstance(value, dict):

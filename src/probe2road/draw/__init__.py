@@ -1,4 +1,4 @@
-"""Graphs over traces for the eye: pictures, the stages of a run, the HTML page."""
+"""Drawing of graphs over traces: pictures, the stages of a run, the HTML page."""
 
 from pkgutil import iter_modules
 

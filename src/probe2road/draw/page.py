@@ -1,4 +1,4 @@
-"""One self-contained HTML file: traces as a density layer, the road graph over it, attributes on a click.
+"""One self-contained HTML file: traces as a density layer, the road graph over it, and attributes on a click.
 
 The page needs no network: MapLibre, the style and all data are inside, and its content security policy
 forbids every request. Densities are counted in Web Mercator, the projection of the page, so that traces and
@@ -69,7 +69,7 @@ def write_page(
     resolution: float = 1.0,
     min_drives: int = 1,
 ) -> None:
-    """Write a road graph, and the fleet data it came from, as one HTML page to look at.
+    """Write a road graph, and the fleet data it came from, as one HTML page.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def page_text(
     resolution: float = 1.0,
     min_drives: int = 1,
 ) -> str:
-    """Return the page as text; see `write_page`. Errors name ``where`` as the place it was meant for."""
+    """Return the page as text (see `write_page`); errors name ``where`` as its place."""
     if not resolution > 0:
         raise OptionError(f"resolution is {resolution}", where="view", fix="use metres per pixel, for example 1.0")
     graph = outgoing(graph, where=where)
@@ -141,7 +141,7 @@ def page_text(
 
 
 def _page(*, title: str, summary: str, data: dict[str, Any]) -> str:
-    """Fill the template in one pass, so that nothing filled in is taken for a placeholder."""
+    """Fill the template in one pass, so that inserted text is never taken for a placeholder."""
     package = resources.files("probe2road")
     read = {
         "maplibre_css": f"{_MAPLIBRE}/maplibre-gl.css",
@@ -166,7 +166,7 @@ def _summary(graph: RoadGraph, fleet: Fleet | None) -> str:
 
 
 def _bounds(graph: RoadGraph, fleet: Fleet | None) -> list[float]:
-    """Return ``[west, south, east, north]`` of everything shown, degrees; the whole world for nothing."""
+    """Return ``[west, south, east, north]`` of everything shown, degrees; the whole world if nothing is shown."""
     boxes = [] if graph.edges.empty else [(graph.bounds, graph.crs)]
     if fleet is not None and not fleet.traces.empty:
         boxes.append((fleet.bounds, fleet.crs))
@@ -181,7 +181,7 @@ def _bounds(graph: RoadGraph, fleet: Fleet | None) -> list[float]:
 
 
 def _edge_table(graph: RoadGraph) -> gpd.GeoDataFrame:
-    """Return the edges without the columns that have no value, numbers at a sensible length."""
+    """Return the edges without empty columns, and with rounded numbers."""
     edges = graph.edges.reset_index().drop(columns="key")
     edges = edges.drop(columns=[name for name in edges if name != "geometry" and edges[name].isna().all()])
     return edges.round(dict.fromkeys((name for name in edges if pd.api.types.is_float_dtype(edges[name].dtype)), 3))
@@ -199,7 +199,7 @@ def _node_features(graph: RoadGraph) -> list[dict[str, Any]]:
 
 
 def _columns(edges: gpd.GeoDataFrame) -> list[dict[str, Any]]:
-    """Say how the panel shows each column: label, unit, decimals."""
+    """Return how the panel shows each column: label, unit, decimals."""
     shown = [name for name in edges if name not in ("key", "geometry")]
     return [
         {
@@ -224,7 +224,7 @@ def _label(name: str) -> str:
 
 
 def _attributes(edges: gpd.GeoDataFrame, color_by: str) -> list[dict[str, Any]]:
-    """Return the colour classes of every column that has values, the chosen one first."""
+    """Return the colour classes of every column with values, the chosen column first."""
     names = [name for name in edges if name not in ("u", "v", "key", "geometry") and edges[name].notna().any()]
     classified = {name: found for name in names if (found := _classes(edges[name])) is not None}
     if edges.empty:
@@ -241,7 +241,7 @@ def _attributes(edges: gpd.GeoDataFrame, color_by: str) -> list[dict[str, Any]]:
 
 
 def _classes(values: pd.Series) -> dict[str, Any] | None:
-    """Return colour classes of a column: quantiles of numbers, or its values if they are few, else None."""
+    """Return colour classes of a column: quantiles of numbers, or its values if there are few, else None."""
     known = values.dropna()
     is_number = pd.api.types.is_numeric_dtype(values.dtype) and not pd.api.types.is_bool_dtype(values.dtype)
     if not is_number:
@@ -262,13 +262,13 @@ def _classes(values: pd.Series) -> dict[str, Any] | None:
 
 
 def _rounded(limits: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Round class limits to three significant digits, keeping them distinct."""
+    """Round class limits to three significant digits, but keep them distinct."""
     digits = 2 - np.floor(np.log10(np.maximum(np.abs(limits), 1e-9))).astype(int)
     return np.unique([round(float(limit), int(digit)) for limit, digit in zip(limits, digits, strict=True)])
 
 
 def _densities(fleet: Fleet, resolution: float, min_drives: int) -> list[dict[str, Any]]:
-    """Count fleet data per pixel in Web Mercator; a close and a far image per channel that has anything."""
+    """Count fleet data per pixel in Web Mercator; return a near and a far image for each channel that is not empty."""
     left, bottom, right, top = fleet.bounds
     _, lat = transform([(left + right) / 2], [(bottom + top) / 2], fleet.crs, WGS84)
     stretch = float(1 / np.cos(np.radians(lat[0])))  # of Web Mercator against the ground
@@ -296,7 +296,7 @@ def _densities(fleet: Fleet, resolution: float, min_drives: int) -> list[dict[st
 
 
 def _image_grid(bounds: tuple[float, float, float, float], resolution: float, margin: float) -> Grid:
-    """Return a grid of whole far pixels that no image is too large for."""
+    """Return a grid whose sides are multiples of the far pixels, small enough for every image."""
     left, bottom, right, top = bounds
     coarsest = (max(right - left, top - bottom) + 2 * margin) / (_LARGEST_IMAGE - 2 * _FAR)
     grid = Grid.from_bounds(bounds, resolution=max(resolution, coarsest), crs=_WEB_MERCATOR, margin=margin)
@@ -310,7 +310,7 @@ def _block_maxima(counts: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def _density_image(counts: NDArray[np.uint32], light: tuple[int, ...], dark: tuple[int, ...]) -> str:
-    """Return counts as a PNG data URL: nothing where zero, else from light to dark with the logarithm.
+    """Return counts as a PNG data URL: transparent for zero, else from light to dark by the logarithm.
 
     Parameters
     ----------
@@ -330,7 +330,7 @@ def _density_image(counts: NDArray[np.uint32], light: tuple[int, ...], dark: tup
 
 
 def _indexed_png(index: NDArray[np.uint8], palette: NDArray[np.uint8], opacity: NDArray[np.uint8]) -> bytes:
-    """Encode an image of palette indices, shape ``(rows, cols)``, with a palette ``(256, 3)`` and its opacity."""
+    """Encode an image of palette indices, shape ``(rows, cols)``, with a palette ``(256, 3)`` and its opacities."""
     image = Image.fromarray(index)
     image.putpalette(palette.tobytes())
     png = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Pictures for reports and documentation: a filmstrip of the stages, and a graph over its traces, as PNG."""
+"""Pictures for reports and documentation: the stages side by side, and a graph over its traces, as PNG."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def write_filmstrip(
     path
         The PNG file.
     bounds
-        ``(left, bottom, right, top)`` of the area in metres; everything there is where it is None.
+        ``(left, bottom, right, top)`` of the area in metres; everything there is if it is None.
     columns
         Panels in a row; further ones start another row.
 
@@ -149,7 +149,7 @@ def draw_graph(
     width: float = 10.0,
     min_drives: int = 1,
 ) -> None:
-    """Draw a graph over its traces, and over a reference graph where there is one.
+    """Draw a graph over its traces, and over a reference graph if one is given.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def draw_graph(
     reference
         Graph to draw underneath as a broad pale band, so that what the two share and miss shows.
     bounds
-        ``(left, bottom, right, top)`` of the area in metres; everything there is where it is None.
+        ``(left, bottom, right, top)`` of the area in metres; everything there is if it is None.
     title
         Heading.
     width
@@ -203,14 +203,14 @@ def draw_graph(
 
 
 def save_figure(figure: Any, path: str | PathLike[str]) -> None:
-    """Write a figure of matplotlib as PNG; without metadata, so that equal pictures are equal files."""
+    """Write a figure of matplotlib as PNG without metadata, so that equal pictures are equal files."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", facecolor="#ffffff", metadata={"Software": None})
     logger.info("wrote %s", path)
 
 
 def _common_bounds(boxes: list[Bounds]) -> Bounds:
-    """Return the box around boxes and a margin; boxes of empty graphs are NaN and do not count."""
+    """Return the box around boxes and a margin; boxes of empty graphs are NaN and are ignored."""
     known = np.array([box for box in boxes if np.isfinite(box).all()])
     if not len(known):
         raise InputError("there is nothing to draw", where="picture", fix="pass bounds")
@@ -256,7 +256,7 @@ def _panels(area: Bounds, rows: int, columns: int, *, side: float = _PANEL, head
 
 
 def _draw_array(axis: Axes, array: NDArray[Any], grid: Grid | None, area: Bounds) -> None:
-    """Draw counts, probabilities or a mask; thin structures survive the reduction to screen pixels."""
+    """Draw counts, probabilities or a mask; thin structures stay visible at screen resolution."""
     from matplotlib.colors import LinearSegmentedColormap
 
     assert grid is not None
@@ -300,7 +300,7 @@ def _draw_edges(axis: Axes, graph: RoadGraph, *, scale: float = 1.0) -> None:
 
 
 def _draw_lines(axis: Axes, lines: NDArray[Any], color: str, width: float, *, level: int) -> None:
-    """Draw lines; what has a higher level lies on top, the raster is on level 1."""
+    """Draw lines; those with a higher level lie on top, and the raster has level 1."""
     from matplotlib.collections import LineCollection
 
     coordinates, owner = shapely.get_coordinates(lines, return_index=True)
@@ -326,7 +326,7 @@ def _legend(axis: Axes, entries: list[tuple[str, float, str]]) -> None:
 
 
 def _frame(axis: Axes, area: Bounds) -> None:
-    """Show the area at equal scale in a thin frame without ticks."""
+    """Show the area at equal scale, in a thin frame without ticks."""
     left, bottom, right, top = area
     axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[], facecolor="#ffffff")
     for spine in axis.spines.values():

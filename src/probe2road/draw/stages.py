@@ -1,4 +1,4 @@
-"""The stages of a run in one picture."""
+"""A picture of the stages of a run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["draw_stages"]
 
 
 def draw_stages(folder: str | Path, fleet: Fleet, path: str | Path) -> None:
-    """Draw what the stages of a run left in its workspace, side by side, as a PNG.
+    """Draw the stages of a run from its workspace, side by side, as a PNG.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A road graph to look at: one verb for the page and the picture, and the page for a notebook or the browser."""
+"""A road graph to look at: one function for the page and the picture, and the page for a notebook or the browser."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _HEIGHT = 600  # pixels of the page in a notebook
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """The HTML page of a road graph, as `explore` makes it: a notebook shows it, `save` keeps it.
+    """The HTML page of a road graph, as returned by `explore`: a notebook shows it, and `save` writes it to a file.
 
     Attributes
     ----------
     title
         Heading of the page.
     text
-        The whole page, which needs no network.
+        The whole page, which works offline.
     """
 
     title: str
@@ -54,7 +54,7 @@ class Page:
             temporary.write_text(self.text, encoding="utf-8")
 
     def show_in_browser(self) -> Path:
-        """Open the page in the web browser, from a file in the system's folder for temporary ones; return its path."""
+        """Open the page in the web browser, from a temporary file, and return the path of the file."""
         path = Path(tempfile.mkdtemp(prefix="probe2road-")) / "roads.html"
         self.save(path)
         opened = webbrowser.open(path.as_uri())
@@ -65,13 +65,13 @@ class Page:
         return f"Page({self.title!r}, {len(self.text) / 1e6:.1f} MB)"
 
     def _repr_html_(self) -> str:
-        """Show the page in a frame of a notebook."""
+        """Show the page in a frame in the notebook."""
         style = f"width: 100%; height: {_HEIGHT}px; border: none"
         return f'<iframe srcdoc="{html.escape(self.text)}" style="{style}" allowfullscreen></iframe>'
 
 
 def require_drawable(path: str | PathLike[str]) -> None:
-    """Refuse a file name that `view` has no format for.
+    """Refuse a file name with a suffix that `view` cannot write.
 
     Raises
     ------
@@ -93,10 +93,10 @@ def view(
     color_by: str | None = None,
     min_drives: int = 1,
 ) -> None:
-    """Draw a road graph over the fleet data that it came from: an HTML page, or a picture.
+    """Draw a road graph over the fleet data that it came from, as an HTML page or a picture.
 
-    The page needs no network, and shows what is known of an edge on a click. The suffix of the file decides which of
-    the two is drawn. Only counts per pixel of the fleet enter them, never a trace.
+    The suffix of the file decides which of the two is drawn. The page works offline, and a click on an edge shows its
+    attributes. Only counts per pixel of the fleet are drawn, never single traces.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def view(
 def explore(
     graph: RoadGraph, *, fleet: Fleet | None = None, title: str = "Road graph", color_by: str = "origin"
 ) -> Page:
-    """Show a road graph as a page to move about in: in the notebook, or else in the web browser.
+    """Show a road graph as an interactive page: in the notebook, or else in the web browser.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a receiver wrote that cannot be true, and traces that are several: unknown, left out or cut, never silently."""
+"""Cleaning of fleet data: impossible values become unknown, bad fixes are left out, joined traces are cut."""
 
 from __future__ import annotations
 
@@ -24,11 +24,17 @@ BY_VEHICLE = "by_vehicle"  # column of the fixes whose trace is all that a vehic
 _PAUSE = 300.0  # s; a vehicle whose next fix is later has begun another drive
 _MOVING = 3.0  # m; shorter steps have no direction
 _FEW_STEPS = 5  # moving steps, below which headings are not judged
+_MANY_STEPS = 20  # moving steps, below which the unit of speeds is not judged
+_LONGEST_STEP = 10.0  # s; in longer ones a vehicle turns and stops, so that its speed tells nothing of the step
+_LIKE = 0.06  # share by which speeds may differ from those in a unit; knots and miles per hour are 0.14 apart
+_SPREAD = 0.3  # share by which half of the ratios of speed to movement may differ from the median
+_IMPLAUSIBLE = 2.0  # ratio of speed to movement, above which or below whose inverse a unit is wrong
+_OTHER_UNITS = {"km/h": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600}  # m/s
 _CONTRADICTION = 60.0  # degrees between heading and movement, in the median of a trace
 
 
 def plausible_headings(table: pd.DataFrame, origin: TableOrigin, *, where: object = None) -> pd.DataFrame:
-    """Take headings and speeds for unknown that stand for "not available": -1, 511, and what is out of range.
+    """Set headings and speeds to unknown that stand for "not available": -1, 511, and values out of range.
 
     Headings are 0 to 360 degrees, or -180 to 180 where there are negative ones other than -1.
 
@@ -58,7 +64,7 @@ def plausible_headings(table: pd.DataFrame, origin: TableOrigin, *, where: objec
 
 
 def accurate_fixes(table: pd.DataFrame, max_accuracy: float, *, where: object = None) -> pd.DataFrame:
-    """Leave out fixes that say themselves that they are less accurate, in metres; unknown accuracies are kept.
+    """Leave out fixes with a recorded accuracy worse than a limit, in metres; unknown accuracies are kept.
 
     Raises
     ------
@@ -79,7 +85,7 @@ def accurate_fixes(table: pd.DataFrame, max_accuracy: float, *, where: object = 
 
 
 def tidied(fleet: Fleet, *, max_speed: float | None = None) -> Fleet:
-    """Return a fleet without jumps and false headings, cut where traces left the box or vehicles paused.
+    """Return a fleet without jumps, false headings and speeds, cut where traces left the box or vehicles paused.
 
     Parameters
     ----------
@@ -101,6 +107,8 @@ def tidied(fleet: Fleet, *, max_speed: float | None = None) -> Fleet:
         traces = _without_jumps(traces, max_speed)
     if "heading" in traces:
         traces = _with_true_headings(traces)
+    if "speed" in traces:
+        traces = _with_true_speeds(traces)
     if traces is fleet.traces and points is fleet.points:
         return fleet
     return type(fleet)(traces, points, fleet.crs)
@@ -151,7 +159,7 @@ def cut_traces(
 
 
 def _steps(traces: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return east and north of the step to every fix, and whether the fix before is of the same trace."""
+    """Return the step to every fix, east and north, and whether the fix before belongs to the same trace."""
     same = np.zeros(len(traces), bool)
     same[1:] = traces["trace_id"].array[1:] == traces["trace_id"].array[:-1]
     east, north = (np.diff(traces[axis].to_numpy(), prepend=np.nan) for axis in "xy")
@@ -159,7 +167,7 @@ def _steps(traces: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 
 def _without_jumps(traces: pd.DataFrame, max_speed: float) -> pd.DataFrame:
-    """Leave out fixes with an impossible step before and behind them, a few rounds for neighbours."""
+    """Leave out fixes with an impossible step before and after them, in a few rounds for neighbours."""
     n = len(traces)
     for _ in range(10):
         east, north, same = _steps(traces)
@@ -180,7 +188,7 @@ def _without_jumps(traces: pd.DataFrame, max_speed: float) -> pd.DataFrame:
 
 
 def _with_true_headings(traces: pd.DataFrame) -> pd.DataFrame:
-    """Take the headings of a trace for unknown that contradict its movement: constants, radians, other zeros."""
+    """Set the headings of a trace to unknown that contradict its movement: constants, radians, other zeros."""
     east, north, same = _steps(traces)
     heading: Any = traces["heading"].to_numpy()
     moving = same & (np.hypot(east, north) > _MOVING) & np.isfinite(heading)
@@ -196,3 +204,29 @@ def _with_true_headings(traces: pd.DataFrame) -> pd.DataFrame:
         *(len(false), len(judged), shown),
     )
     return traces.assign(heading=np.where(traces["trace_id"].isin(false), np.nan, heading))
+
+
+def _with_true_speeds(traces: pd.DataFrame) -> pd.DataFrame:
+    """Convert speeds that are those of the movement in another unit, and warn of those that cannot be in any."""
+    east, north, same = _steps(traces)
+    step = np.hypot(east, north)
+    seconds = traces["t"].diff().dt.total_seconds().to_numpy()
+    speed: Any = traces["speed"].to_numpy()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        usable = same & (step > _MOVING) & (seconds > 0) & (seconds <= _LONGEST_STEP) & (speed > 0)
+        ratio = (speed * seconds / step)[usable]
+    if len(ratio) < _MANY_STEPS:
+        return traces
+    low, middle, high = np.quantile(ratio, [0.25, 0.5, 0.75])
+    if high - low > 2 * _SPREAD * middle:
+        return traces
+    for unit, factor in _OTHER_UNITS.items():
+        if abs(middle * factor - 1) <= _LIKE:
+            logger.warning(
+                "speeds are %.2f times those of the movement: taken as %s; say the unit in the name of the column",
+                *(middle, unit),
+            )
+            return traces.assign(speed=speed * factor)
+    if not 1 / _IMPLAUSIBLE <= middle <= _IMPLAUSIBLE:
+        logger.warning("speeds are %.2f times those of the movement: check their unit", middle)
+    return traces

@@ -78,17 +78,17 @@ class Fleet:
 
     @property
     def starts(self) -> NDArray[np.int64]:
-        """Row at which each trace starts, then the number of rows: shape ``(n_traces + 1,)``."""
+        """Return the row at which each trace starts, then the number of rows: shape ``(n_traces + 1,)``."""
         return run_starts(self.traces["trace_id"])
 
     @property
     def n_traces(self) -> int:
-        """Number of traces."""
+        """Return the number of traces."""
         return len(self.starts) - 1
 
     @cached_property
     def owner(self) -> NDArray[np.int64]:
-        """Number of the trace of every fix, from 0: shape ``(n_fixes,)``, cannot be written to."""
+        """Return the number of the trace of every fix, from 0: shape ``(n_fixes,)``, read-only."""
         starts = self.starts
         owner = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
         owner.setflags(write=False)
@@ -96,12 +96,12 @@ class Fleet:
 
     @cached_property
     def ids(self) -> pd.Index:
-        """Id of every trace: ``fleet.ids[fleet.owner]`` are the ids of the fixes."""
+        """Return the id of every trace: ``fleet.ids[fleet.owner]`` are the ids of the fixes."""
         return pd.Index(self.traces["trace_id"].iloc[self.starts[:-1]])
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """Bounding box ``(left, bottom, right, top)`` of the traces, metres.
+        """Return the bounding box ``(left, bottom, right, top)`` of the traces, metres.
 
         Semantic points do not enlarge it: a point far from every trace is noise.
         """
@@ -112,7 +112,7 @@ class Fleet:
         return f"Fleet({self.n_traces} traces, {len(self.traces)} fixes, {len(self.points)} points, {self.crs.name})"
 
     def _repr_html_(self) -> str:
-        """Show figures in a notebook, and no id."""
+        """Show figures in a notebook, without any ids."""
         kinds = self.points["kind"].value_counts()
         figures = {"traces": self.n_traces, "fixes": len(self.traces), **{str(kind): n for kind, n in kinds.items()}}
         return figures_table("Fleet", {**figures, "CRS": self.crs.name})
@@ -134,7 +134,7 @@ class Fleet:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the tables alone for pickling and copying: what was found in them is quickly found again."""
+        """Return the tables alone for pickling and copying, because derived values are quickly computed again."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
@@ -156,7 +156,7 @@ class TraceGaps:
 
 
 def trace_breaks(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool_]:
-    """Mark the fixes that no segment may reach from the fix before.
+    """Mark the fixes that are not connected to the fix before.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def trace_breaks(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool
 
 
 def stray_fixes(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool_]:
-    """Mark fixes inside a trace that nobody can have driven to and back from, while those around them agree.
+    """Mark fixes inside a trace that no vehicle can have driven to and back from, between fixes that agree.
 
     A receiver that sees a reflection jumps aside for a fix or two and comes back. The trace goes on from before to
     behind as if they were not there. At most a third of a trace is marked; where it would be more, its id stands for
@@ -235,7 +235,7 @@ def stray_fixes(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool_
     starts = fleet.starts
 
     def is_jump(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Say whether nobody can have driven from the one fix to the other."""
+        """Tell whether no vehicle can have driven from the one fix to the other."""
         step = np.hypot(x[second] - x[first], y[second] - y[first])
         seconds = (time[second] - time[first]) / np.timedelta64(1, "s")
         with np.errstate(invalid="ignore"):
@@ -285,7 +285,7 @@ def _strays_of_trace(
 def _is_coarse(
     x: NDArray[np.float64], y: NDArray[np.float64], time: NDArray[Any], first: int, stop: int, gaps: TraceGaps
 ) -> bool:
-    """Say whether a trace without clock has such long steps that a long one is no jump."""
+    """Tell whether a trace without a clock has so long steps that a long step is not a jump."""
     step = np.hypot(np.diff(x[first:stop]), np.diff(y[first:stop]))
     return bool(np.isnat(time[first]) and gaps.step_factor * np.median(step) > gaps.max_step)
 
@@ -415,7 +415,7 @@ def _metric_target(traces: pd.DataFrame, source: CRS, target_crs: Any, where: ob
 
 
 def _is_metric(crs: CRS) -> bool:
-    """Say whether `require_metric` accepts a CRS."""
+    """Tell whether `require_metric` accepts a CRS."""
     try:
         require_metric(crs)
     except CRSError:
@@ -435,7 +435,7 @@ def _projected(table: pd.DataFrame, source: CRS, target: CRS) -> pd.DataFrame:
 
 
 def fix_intervals(times: pd.Series) -> NDArray[np.float64]:
-    """Seconds since the row before, also across traces; NaN where there is none or no clock."""
+    """Return the seconds since the row before, also across traces; NaN for the first row or without a clock."""
     time = times.to_numpy(dtype="datetime64[ns]")
     seconds = np.diff(time, prepend=np.datetime64("NaT", "ns")) / np.timedelta64(1, "s")
     return np.asarray(seconds, np.float64)
@@ -448,7 +448,7 @@ def _grown_limit(
     limit: float,
     factor: float,
 ) -> NDArray[np.float64]:
-    """Per trace, the larger of the fixed limit and a multiple of the trace's own median value."""
+    """Return, for each trace, the larger of the fixed limit and a multiple of the median value of the trace."""
     counted = counted & np.isfinite(values)
     medians = pd.Series(values[counted]).groupby(owner[counted]).median()
     limits = np.full(owner[-1] + 1, limit)

@@ -1,4 +1,4 @@
-"""Fixes and points that no vehicle can have been at, found before they decide the area and the CRS of a run.
+"""Fixes and points at impossible positions, found before they affect the area and the CRS of a run.
 
 Strategy
 --------
@@ -37,7 +37,7 @@ _NAMED = 5  # fixes in one warning
 @dataclass(frozen=True)
 @checked
 class OutlierOptions:
-    """Which fixes and points are left out, because no vehicle can have been there."""
+    """Which fixes and points are left out because no vehicle can have been there."""
 
     drop: bool = True  # whether any are left out
     min_jump: Positive[float] = 5000.0  # m; a shorter step is left to what breaks traces
@@ -49,7 +49,7 @@ class OutlierOptions:
 
 
 def impossible_fixes(traces: pd.DataFrame, crs: CRS, *, options: OutlierOptions | None = None) -> NDArray[np.bool_]:
-    """Mark the fixes that no vehicle can have been at.
+    """Mark the fixes at positions where no vehicle can have been.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def impossible_fixes(traces: pd.DataFrame, crs: CRS, *, options: OutlierOptions 
 def without_impossible_fixes(
     traces: pd.DataFrame, crs: CRS, *, options: OutlierOptions | None = None, where: object = None
 ) -> pd.DataFrame:
-    """Return the traces without `impossible_fixes`, and warn of those that are left out.
+    """Return the traces without `impossible_fixes`, with a warning about the fixes left out.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def without_impossible_points(
     *,
     options: OutlierOptions | None = None,
 ) -> pd.DataFrame:
-    """Return the semantic points that lie near their traces, and warn of those that are left out.
+    """Return the semantic points that lie near their traces, with a warning about the points left out.
 
     Points of a trace that is not there stay: they are seen from somewhere. They are counted in a warning, too.
 
@@ -202,7 +202,7 @@ def _at_null_island(traces: pd.DataFrame, crs: CRS, options: OutlierOptions) -> 
 
 
 def _jumps(traces: pd.DataFrame, crs: CRS, starts: NDArray[np.int64], options: OutlierOptions) -> NDArray[np.bool_]:
-    """Mark fixes that nobody can have driven to from the fix before."""
+    """Mark fixes to which no vehicle can have driven from the fix before."""
     x, y = (traces[axis].to_numpy() for axis in "xy")
     far = np.zeros(len(x), bool)
     far[1:] = _distance(x[:-1], y[:-1], x[1:], y[1:], crs) > options.min_jump
@@ -220,7 +220,7 @@ def _too_far(
     second: NDArray[np.int64],
     options: OutlierOptions,
 ) -> NDArray[np.bool_]:
-    """Say whether nobody can have driven from some fixes to later ones of their traces."""
+    """Tell whether no vehicle can have driven from some fixes to later ones of their traces."""
     x, y = (traces[axis].to_numpy() for axis in "xy")
     time = traces["t"].to_numpy(dtype="datetime64[ns]")
     step = _distance(x[first], y[first], x[second], y[second], crs)
@@ -237,7 +237,7 @@ def _too_far(
 def _distance(
     x: NDArray[np.float64], y: NDArray[np.float64], to_x: NDArray[np.float64], to_y: NDArray[np.float64], crs: CRS
 ) -> NDArray[np.float64]:
-    """Return distances (m); across the ball where the coordinates are degrees."""
+    """Return distances (m), along the globe if the coordinates are degrees."""
     if not crs.is_geographic:
         return np.hypot(to_x - x, to_y - y)
     lon, lat, to_lon, to_lat = (np.radians(angle) for angle in (x, y, to_x, to_y))

@@ -1,4 +1,4 @@
-"""One table of fleet data: its columns, their types, and everything that can be wrong with them.
+"""The check of one table of fleet data: its columns, their types, and all possible faults.
 
 The checks look at the whole table before they speak, so that a user fixes a bad file once, not fault by
 fault. What can be repaired without losing information (row order, exact duplicates) is repaired and logged.
@@ -63,7 +63,7 @@ _FAR_FROM_CRS = 20.0  # degrees outside the area of use of a CRS, beyond which t
 
 @dataclass(frozen=True)
 class TableOrigin:
-    """Where a table came from, in the words its author knows, for messages."""
+    """Where a table came from, in the words of its author, for messages."""
 
     name: str = "traces"  # what is in the table
     row_word: str = "row"  # "line" for text files
@@ -72,12 +72,12 @@ class TableOrigin:
     by_name: Collection[str] = ()  # our columns that were taken for their usual names alone, not named by the user
 
     def column(self, ours: str) -> str:
-        """Return how to call one of our columns in a message."""
+        """Return the name of one of our columns for a message."""
         theirs = self.columns.get(ours, ours)
         return repr(ours) if theirs == ours else f"{theirs!r} ({ours})"
 
     def rows(self, mask: NDArray[np.bool_], values: Any) -> str:
-        """Say how many rows the mask means, and show the first few."""
+        """Return as text how many rows a mask selects, and the first few of them."""
         rows = np.flatnonzero(mask)
         values = np.asarray(pd.Series(values).iloc[rows[:_EXAMPLES_SHOWN]])
         shown = ", ".join(
@@ -87,27 +87,27 @@ class TableOrigin:
 
 
 class _Checks:
-    """What is found wrong with one table: faults of it all, and rows that could be left out."""
+    """The faults found in one table: those of the whole table, and rows that can be left out."""
 
     def __init__(self, origin: TableOrigin, faults: list[str]) -> None:
         self.origin, self.faults = origin, faults
         self.rows: list[tuple[str, NDArray[np.bool_]]] = []
 
     def name(self, ours: str) -> str:
-        """Return how to call a column at the start of a fault."""
+        """Return the name of a column for the start of a fault."""
         return f"{self.origin.name}: column {self.origin.column(ours)}"
 
     def fault(self, fault: str) -> None:
-        """Note what is wrong with the table."""
+        """Add a fault of the table."""
         self.faults.append(fault)
 
     def row_fault(self, fault: str, mask: NDArray[np.bool_]) -> None:
-        """Note what is wrong with some rows."""
+        """Add a fault of some rows."""
         self.rows.append((fault, mask))
 
 
 def may_leave_out(n_bad: int, n_rows: int, invalid: str | None) -> bool:
-    """Say whether bad rows are left out: ``"drop"``, ``"refuse"``, or None for up to 5 % of them.
+    """Tell whether bad rows are left out: ``"drop"``, ``"refuse"``, or None for up to 5 % of them.
 
     Examples
     --------
@@ -179,7 +179,7 @@ def empty_points(trace_ids: pd.Series) -> pd.DataFrame:
 
 
 def sort_fixes(traces: pd.DataFrame, crs: CRS, faults: list[str], *, invalid: str | None = "refuse") -> pd.DataFrame:
-    """Sort by trace and time and drop repeated fixes; what no clock can order is a fault, or left out.
+    """Sort fixes by trace and time and drop repeated ones; fixes that cannot be sorted are a fault, or left out.
 
     Those are fixes that repeat the time of the fix before at another place, and fixes without time in a trace that
     has times. Rows without time keep their order. A table that is in order already is returned as it is.
@@ -224,7 +224,7 @@ def sort_fixes(traces: pd.DataFrame, crs: CRS, faults: list[str], *, invalid: st
 
 
 def run_starts(ids: pd.Series) -> NDArray[np.int64]:
-    """Offsets of the runs of equal values, and the length at the end.
+    """Return the offsets of the runs of equal values, and the length at the end.
 
     Examples
     --------
@@ -241,7 +241,7 @@ def run_starts(ids: pd.Series) -> NDArray[np.int64]:
 
 
 def _with_whole_clocks(traces: pd.DataFrame, faults: list[str], invalid: str | None) -> pd.DataFrame:
-    """Leave out fixes without time of traces that have times, or name those traces."""
+    """Leave out fixes without a time in traces that have times, or report these traces."""
     untimed = traces["t"].isna()
     if not untimed.any() or untimed.all():
         return traces
@@ -307,7 +307,7 @@ def _checked(
 
 
 def _rows_to_keep(n: int, checks: _Checks, invalid: str | None, *, complain: bool) -> NDArray[np.bool_]:
-    """Mark the rows that are not left out; where too many would be, what is wrong with them becomes a fault."""
+    """Mark the rows that are kept; if too many would be left out, their faults become faults of the table."""
     keep = np.ones(n, bool)
     for _, mask in checks.rows:
         keep &= ~mask
@@ -325,7 +325,7 @@ def _rows_to_keep(n: int, checks: _Checks, invalid: str | None, *, complain: boo
 
 
 def _identifiers(ids: pd.Series, checks: _Checks) -> Any:
-    """Check trace ids for holes, and bring mixed types and bytes to text, so that they sort."""
+    """Check trace ids for missing values, and convert mixed types and bytes to text, so that they can be sorted."""
     name = checks.name("trace_id")
     empty = ids.isna().to_numpy()
     if pd.api.types.is_string_dtype(ids.dtype) and not pd.api.types.is_object_dtype(ids.dtype):
@@ -385,7 +385,7 @@ def _measured(values: pd.Series, checks: _Checks, invalid: str | None) -> NDArra
 
 
 def _may_hold_numbers(values: pd.Series) -> bool:
-    """Say whether a column is of a type that numbers may be written in."""
+    """Tell whether a column has a type in which numbers can be written."""
     return _is_plain_numeric(values) or values.dtype.kind not in "bmM"
 
 
@@ -445,12 +445,12 @@ def _times_of_seconds(values: pd.Series, checks: _Checks) -> pd.Series:
 
 
 def _no_times(n: int) -> pd.Series:
-    """Return n missing times."""
+    """Return an array of n missing times."""
     return pd.Series(np.full(n, np.datetime64("NaT", "ns"))).dt.tz_localize("UTC")
 
 
 def _kinds(values: pd.Series, checks: _Checks) -> pd.Categorical:
-    """Convert a column to the categories of semantic points, or name the values that are none."""
+    """Convert a column to the categories of semantic points, or report the values that are no category."""
     codes, found = pd.factorize(values, use_na_sentinel=False)
     unknown = [str(kind) for kind in found if kind not in POINT_KINDS]
     if unknown:
@@ -460,14 +460,15 @@ def _kinds(values: pd.Series, checks: _Checks) -> pd.Categorical:
 
 
 def _degree_faults(lon: NDArray[np.float64], lat: NDArray[np.float64], checks: _Checks) -> None:
-    """Note longitudes and latitudes that are out of range, and say so where the two axes look swapped."""
+    """Report longitudes and latitudes that are out of range, and whether the two axes look swapped."""
     if not (np.isfinite(lon).any() and np.isfinite(lat).any()):
         return
     bad_lon, bad_lat = np.abs(lon) > 180, np.abs(lat) > 90  # such as 181 and 91: "not available" to many receivers
     middle = float(np.nanmedian(np.abs(lat)))
     swapped = _SWAPPED if middle > _POLAR and np.nanmax(np.abs(lon)) <= 90 else ""
     projected = (
-        '; the values look projected: pass their CRS, for example crs="EPSG:32616"'
+        '; the values look projected: pass their CRS, for example crs="EPSG:32616" (integers of 1e-6 or 1e-7 degrees '
+        "are read from columns called lat_e6 or lat_e7)"
         if max(np.nanmax(np.abs(lon)), middle) > 1000
         else ""
     )
@@ -479,7 +480,7 @@ def _degree_faults(lon: NDArray[np.float64], lat: NDArray[np.float64], checks: _
 
 
 def _polar_faults(lon: NDArray[np.float64], lat: NDArray[np.float64]) -> list[str]:
-    """Name latitudes that are at a pole, where the two axes are likelier swapped."""
+    """Report latitudes at a pole, which are probably swapped axes."""
     if float(np.median(np.abs(lat))) <= _POLAR:
         return []
     swapped = _SWAPPED if np.abs(lon).max() <= 90 else ""
@@ -488,7 +489,7 @@ def _polar_faults(lon: NDArray[np.float64], lat: NDArray[np.float64]) -> list[st
 
 
 def _metre_faults(x: NDArray[np.float64], y: NDArray[np.float64], crs: CRS) -> list[str]:
-    """Name projected coordinates that are degrees, or far from where the CRS is used."""
+    """Report projected coordinates that are degrees, or far from the area where the CRS is used."""
     extent = f"x {x.min():.6g}..{x.max():.6g}, y {y.min():.6g}..{y.max():.6g}"
     spread = float(np.hypot(np.ptp(x), np.ptp(y)))
     if max(np.abs(x).max(), np.abs(y).max()) <= 180 and 0 < spread < _SPREAD_OF_DEGREES:
@@ -500,7 +501,7 @@ def _metre_faults(x: NDArray[np.float64], y: NDArray[np.float64], crs: CRS) -> l
 
 
 def _in_area_of_use(x: NDArray[np.float64], y: NDArray[np.float64], crs: CRS) -> bool:
-    """Say whether the extremes lie in or near the area of use of the CRS; True where it names none."""
+    """Tell whether the extremes lie in or near the area of use of the CRS; True if the CRS has no such area."""
     extremes = np.array([x.argmin(), x.argmax(), y.argmin(), y.argmax()])
     lon, lat = (np.asarray(axis) for axis in transform(x[extremes], y[extremes], crs, WGS84))
     if not (np.isfinite(lon).all() and np.isfinite(lat).all()):
@@ -515,7 +516,7 @@ def _in_area_of_use(x: NDArray[np.float64], y: NDArray[np.float64], crs: CRS) ->
 
 
 def _codes(ids: pd.Series) -> NDArray[np.int64]:
-    """Integers that order and separate like the ids; only one id of a run is looked at."""
+    """Return integers with the order of the ids, computed from only one id of each run."""
     if pd.api.types.is_integer_dtype(ids.dtype) and not ids.hasnans:
         return ids.to_numpy(np.int64)
     starts = run_starts(ids)
@@ -524,12 +525,12 @@ def _codes(ids: pd.Series) -> NDArray[np.int64]:
 
 
 def _few(values: Any) -> str:
-    """List the first few values."""
+    """Return the first few values as text."""
     values = list(values)
     return ", ".join(map(_brief, values[:_EXAMPLES_SHOWN])) + (", ..." if len(values) > _EXAMPLES_SHOWN else "")
 
 
 def _brief(value: Any) -> str:
-    """Write a value in a message, cut where it is long."""
+    """Return a value as text for a message, shortened if it is long."""
     text = str(value)
     return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."

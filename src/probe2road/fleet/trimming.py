@@ -1,4 +1,4 @@
-"""The ends of drives, which say where somebody lives and works, left out."""
+"""Trimming: the ends of drives, which show where somebody lives and works, are left out."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 
 def trim_ends(fleet: Fleet, metres: float) -> Fleet:
-    """Leave out the first and last metres of every trace, with the semantic points that were seen there.
+    """Leave out the first and last metres of every trace, and the semantic points that were seen there.
 
     A trace that is not longer than both ends goes altogether. Metres are counted along the trace, in plan.
 
@@ -71,7 +71,7 @@ def trim_ends(fleet: Fleet, metres: float) -> Fleet:
 
 
 def _seen_between(fleet: Fleet, traces: pd.DataFrame, metres: float) -> np.ndarray:
-    """Mark the points of what is left: by their time, and where there is none by their distance from the ends."""
+    """Mark the points of the kept part: by their time, or without times by their distance from the ends."""
     if fleet.points.empty:
         return np.zeros(0, bool)
     owner = fleet.points["trace_id"]

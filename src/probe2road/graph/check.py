@@ -1,4 +1,4 @@
-"""The invariants of a road graph, verified."""
+"""The check of the invariants of a road graph."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _END_TOLERANCE = 1e-3  # m; an edge ends at its node to within this
 
 
 def check_graph(graph: RoadGraph) -> None:
-    """Verify the invariants of a road graph.
+    """Check the invariants of a road graph, and report all faults at once.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def check_graph(graph: RoadGraph) -> None:
 
 
 def require_sound(graph: RoadGraph, *, where: object) -> None:
-    """Refuse a graph that `check_graph` refuses; the error says where it is from. For readers and writers."""
+    """Check a graph in the same way as `check_graph`, and name its source in errors; for readers and writers."""
     nodes, edges = graph.nodes, graph.edges
     missing = [column for column in (*EDGE_DTYPES, "geometry") if column not in edges]
     if missing:
@@ -76,7 +76,7 @@ def _dangling_ends(graph: RoadGraph) -> list[str]:
 
 
 def _edge_faults(graph: RoadGraph) -> list[str]:
-    """Faults of single edges, one line for each kind with the first offender's id."""
+    """List the faults of single edges: one line for each kind, with the id of the first such edge."""
     edges = graph.edges
     geometry = edges.geometry.to_numpy()
     kind = shapely.get_type_id(geometry) == shapely.GeometryType.LINESTRING
@@ -84,7 +84,7 @@ def _edge_faults(graph: RoadGraph) -> list[str]:
         return [f"edge {edges.index[~kind][0]} is not a LineString"]
     position = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
     checks = {"has no length": shapely.length(geometry) > 0}
-    # Not those that the graph keeps: what is checked here may have been changed since.
+    # The rows that the graph has stored are not used: the tables may have been changed since.
     for end, vertex, row in zip("uv", (0, -1), end_rows(graph.nodes, edges).T, strict=True):
         ends = shapely.get_coordinates(shapely.get_point(geometry, vertex))
         away = np.hypot(*(ends - position[row]).T)
@@ -100,7 +100,7 @@ def _edge_faults(graph: RoadGraph) -> list[str]:
 
 
 def _turn_faults(graph: RoadGraph) -> list[str]:
-    """List turns that name an edge that does not exist, or a node at which their edges do not meet."""
+    """List turns that name a missing edge, or a node at which their edges do not meet."""
     turns, edges = graph.turns, graph.edges
     known = turns["from_edge"].isin(edges.index) & turns["to_edge"].isin(edges.index)
     if not known.all():

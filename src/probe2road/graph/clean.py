@@ -1,4 +1,4 @@
-"""Cleaning of a road graph: degree-2 nodes, dead ends, short edges between junctions, small components.
+"""Cleaning of road graphs: degree-2 nodes, dead ends, short edges between junctions, small components.
 
 Strategy
 --------
@@ -46,7 +46,7 @@ _STRENGTH = {"segmentation": 0, "reference": 1, "gap": 2}  # a chain takes the o
 @dataclass(frozen=True)
 @checked
 class CleanOptions:
-    """What counts as a flaw of a graph."""
+    """Which parts of a graph count as flaws."""
 
     short_edge: NotNegative[float] = 15.0  # m; edges between junctions up to this long are collapsed; 0 keeps all
     max_ring: NotNegative[float] = 120.0  # m; rings with a perimeter of 2 short_edge up to this keep their edges
@@ -55,7 +55,7 @@ class CleanOptions:
 
 
 def clean_graph(graph: RoadGraph, *, options: CleanOptions | None = None) -> RoadGraph:
-    """Clean a graph until nothing changes any more.
+    """Clean a graph repeatedly until nothing changes any more.
 
     Each round drops small components and short dead ends, then collapses short edges between junctions, then
     merges nodes of degree 2. Dead ends go first because a spur cuts a road into short edges that are none once
@@ -66,7 +66,7 @@ def clean_graph(graph: RoadGraph, *, options: CleanOptions | None = None) -> Roa
     graph
         Any road graph.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -100,7 +100,7 @@ def clean_graph(graph: RoadGraph, *, options: CleanOptions | None = None) -> Roa
 
 
 def drop_edges(graph: RoadGraph, dropped: NDArray[np.bool_], *, why: str) -> RoadGraph:
-    """Drop edges, the nodes that lose their last edge, and the turns on them; the graph itself where none is.
+    """Drop edges, their turns, and the nodes that lose their last edge; return the same graph if no edge is dropped.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def drop_edges(graph: RoadGraph, dropped: NDArray[np.bool_], *, why: str) -> Roa
 
 
 def drop_small_components(graph: RoadGraph, *, min_length: float = 15.0) -> RoadGraph:
-    """Drop connected components with a total length below ``min_length`` (m); turns on them go with them.
+    """Drop connected components with a total length below ``min_length`` (m), and the turns on them.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def drop_small_components(graph: RoadGraph, *, min_length: float = 15.0) -> Road
 
 
 def drop_dead_ends(graph: RoadGraph, *, min_length: float = 15.0) -> RoadGraph:
-    """Drop dead ends shorter than ``min_length`` (m), and isolated edges as short, to a fixed point.
+    """Drop dead ends and isolated edges shorter than ``min_length`` (m), repeatedly until none is left.
 
     Lengths are measured up to the junction: nodes of degree 2 are merged first, and again after each round. At a
     junction the shortest go first and two ends always stay. A road that ends in a fork of two spurs so keeps the
@@ -209,7 +209,7 @@ def drop_dead_ends(graph: RoadGraph, *, min_length: float = 15.0) -> RoadGraph:
 
 
 def collapse_short_edges(graph: RoadGraph, *, max_length: float = 15.0, max_ring: float = 120.0) -> RoadGraph:
-    """Collapse edges of at most ``max_length`` (m) between two junctions, shortest first, to a fixed point.
+    """Collapse edges of at most ``max_length`` (m) between two junctions, the shortest first, until none is left.
 
     Two junctions become one in the middle, weighted by the number of junctions that went into each. Around
     it, within one and a half times the distance of the two, the other edges become straight lines to it, which
@@ -276,7 +276,7 @@ def collapse_short_edges(graph: RoadGraph, *, max_length: float = 15.0, max_ring
 
 
 def merge_degree_two_nodes(graph: RoadGraph) -> RoadGraph:
-    """Join the edges that meet at nodes of degree 2 into one edge each.
+    """Join the edges that meet at nodes of degree 2 into one edge.
 
     No vertex is lost: the joint stays as a vertex of the line. Loops and parallel edges survive, and a ring
     without junctions keeps one node, the start of its first edge. Nodes without edges stay. A graph without
@@ -320,7 +320,7 @@ def merge_degree_two_nodes(graph: RoadGraph) -> RoadGraph:
     members, backwards, starts = chains(mate)
     stops = np.append(starts[1:], len(members))
     first, last = members[starts], members[stops - 1]
-    # The first member in table order names the chain; the walk runs in its direction.
+    # The first member in table order gives the chain its id and direction.
     name = np.minimum.reduceat(members, starts)
     node = graph.nodes.index.to_numpy()
     merged = graph.edges.iloc[name].assign(
@@ -339,13 +339,13 @@ def merge_degree_two_nodes(graph: RoadGraph) -> RoadGraph:
 
 
 def _network(graph: RoadGraph) -> Topology:
-    """Take a graph apart into arrays; heights stay with the vertices."""
+    """Return a graph as arrays; heights stay with the vertices."""
     u, v = graph.end_rows.T
     lines = graph.edges.geometry.to_numpy()
     vertices = shapely.get_coordinates(lines, include_z=bool(shapely.has_z(lines).any()))
     return Topology(
         position=shapely.get_coordinates(graph.nodes.geometry.to_numpy()),
-        u=u.copy(),  # not a column of a table that is read-only: one type of array for the kernels
+        u=u.copy(),  # a writable copy, so that compiled functions get one type of array
         v=v.copy(),
         vertices=vertices,
         offsets=np.concatenate([[0], np.cumsum(shapely.get_num_coordinates(lines))]),
@@ -373,7 +373,7 @@ def _joined_attributes(
     def column(name: str) -> NDArray[np.float64]:
         return edges[name].to_numpy("float64", na_value=np.nan)[members]
 
-    def minimum(values: NDArray[np.float64]) -> Any:  # NaN wins, as it must
+    def minimum(values: NDArray[np.float64]) -> Any:  # NaN if any value is NaN
         return pd.array(np.minimum.reduceat(values, starts), dtype="Float64").astype("Int64")
 
     ahead, against = column("forward"), column("backward")
@@ -381,7 +381,7 @@ def _joined_attributes(
     known = np.add.reduceat(weight, starts)
     score = np.add.reduceat(weight * np.nan_to_num(column("score")), starts)
     mean = np.divide(score, known, out=np.full(len(starts), np.nan), where=known > 0)
-    single = np.diff(np.append(starts, len(members))) == 1  # no rounding where there is nothing to average
+    single = np.diff(np.append(starts, len(members))) == 1  # single members are not averaged, which avoids rounding
     strength = edges["origin"].map(_STRENGTH).to_numpy()[members]
     return {
         "origin": np.array(list(_STRENGTH))[np.minimum.reduceat(strength, starts)],
@@ -393,7 +393,7 @@ def _joined_attributes(
 
 
 def _renamed_turns(turns: pd.DataFrame, *, edges: pd.Series, nodes: pd.Series | None = None) -> pd.DataFrame:
-    """Give turns the new ids of their edges and nodes, drop those whose edge is gone, add up those that coincide."""
+    """Give turns the new ids of their edges and nodes, drop turns of dropped edges, and add up equal ones."""
     if turns.empty:
         return turns
     known = turns[turns["from_edge"].isin(edges.index) & turns["to_edge"].isin(edges.index)]

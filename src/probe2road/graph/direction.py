@@ -1,11 +1,11 @@
-"""Which way an edge may be driven: one table of words, and one rule for counts.
+"""The driving direction of edges: from the words of tags and columns, and from the counts of drives.
 
-Strategy: what a map or a sign says comes first (a column ``oneway``), in the words of OpenStreetMap or of GIS files.
-Where nothing is said, the drives are weighed: three models of how traversals fall on the two directions compete, and
-the winner counts once it is certain enough. Refinement does this once and writes the result into ``oneway``; a graph
-that has bare counts is judged by the same rule whenever it is asked.
+Strategy: a column ``oneway`` from a map or a sign comes first, in the words of OpenStreetMap or of GIS files. Without
+it, the counts of drives decide: three models (one-way, one-way the other way, both ways) explain the traversals in the
+two directions, and the most probable model is taken if it is certain enough. Refinement does this once and writes the
+result into ``oneway``; for a graph that has only counts, the same rule is applied at every call.
 
-An edge that is open one way only is stored in its driving direction: `in_driving_direction` turns the others.
+A one-way edge is stored in its driving direction: `in_driving_direction` reverses edges that are not.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ __all__ = [
 ]
 
 WAYS = (1, -1, 0)  # from u to v only, from v to u only, both: the columns of `oneway_probabilities`
-ONEWAY_TAGS = {1: "yes", -1: "-1", 0: "no"}  # what OpenStreetMap writes for them
+ONEWAY_TAGS = {1: "yes", -1: "-1", 0: "no"}  # the words of OpenStreetMap for them
 ONEWAY_WORDS = {
     **{"yes": 1, "true": 1, "1": 1, "1.0": 1},
     **{"-1": -1, "-1.0": -1, "reverse": -1},
     **{"no": 0, "false": 0, "0": 0, "0.0": 0},
-    **{"reversible": 0, "alternating": 0},  # one way at a time, but each at some time
+    **{"reversible": 0, "alternating": 0},  # one direction at a time, and the other at another time
     **{"f": 1, "t": -1, "b": 0},  # extracts of OSM for GIS: from, to, both
     **{"ft": 1, "tf": -1},  # GIS networks: from-to, to-from
-}  # what is read, in lower case
+}  # words that are read, in lower case
 
 DIRECTION_TAGS = ("oneway", "highway", "junction")  # tags that say which way a way of OpenStreetMap may be driven
 _IMPLYING_CLASSES = ("motorway", "motorway_link")
@@ -60,16 +60,16 @@ _SIDE = re.compile(rf"(?<![a-z])({'|'.join(_SIDES)})(?![a-z])")
 @dataclass(frozen=True)
 @checked
 class DirectionOptions:
-    """When counts call an edge one-way, or open both ways."""
+    """When counts make an edge one-way, or open in both directions."""
 
     min_confidence: Probability = 0.9  # probability from which the counts decide
     wrong_way: Probability = 0.02  # share of traversals of a one-way road that are matched the wrong way
-    imbalance: Positive[float] = 2.0  # a of Beta(a, a), the law of the share of one direction on two-way roads
-    oneway_share: Probability = 0.5  # of edges that are one-way, before anything was counted
+    imbalance: Positive[float] = 2.0  # a of Beta(a, a), the distribution of the share of one direction on two-way roads
+    oneway_share: Probability = 0.5  # prior share of edges that are one-way
 
 
 def told_direction(oneway: pd.Series) -> pd.Series:
-    """Read the values of a column ``oneway``: 1 as the line is drawn, -1 against it, 0 both ways.
+    """Read the values of a column ``oneway``: 1 along the line, -1 against it, 0 for both directions.
 
     Upper and lower case are alike, numbers and flags are read like their text. A word that is not in `ONEWAY_WORDS`
     says nothing.
@@ -96,7 +96,7 @@ def told_direction(oneway: pd.Series) -> pd.Series:
 
 
 def tagged_direction(tags: pd.DataFrame) -> pd.Series:
-    """Say which way ways of OpenStreetMap may be driven, by their tags.
+    """Return the driving direction of ways of OpenStreetMap, from their tags.
 
     Where ``oneway`` says nothing, motorways, their links and roundabouts are one-way as drawn. For motorway links
     this is what routers do, and how most are mapped.
@@ -125,7 +125,7 @@ def tagged_direction(tags: pd.DataFrame) -> pd.Series:
 def oneway_probabilities(
     forward: NDArray[np.float64], backward: NDArray[np.float64], *, options: DirectionOptions | None = None
 ) -> NDArray[np.float64]:
-    """Return the probabilities that edges are one-way from u to v, one-way from v to u, or open both ways.
+    """Return the probabilities that edges are one-way from u to v, one-way from v to u, or open in both directions.
 
     Bayes' law for three models of how traversals fall on the two directions: all but a few wrongly matched ones on
     one, or on both in a share that follows a Beta distribution.
@@ -162,14 +162,14 @@ def oneway_probabilities(
 
 
 def counted_direction(edges: pd.DataFrame, *, options: DirectionOptions | None = None) -> pd.Series:
-    """Say which way edges may be driven by their counts alone, where these are certain enough.
+    """Return the driving direction of edges from their counts alone, if the counts are certain enough.
 
     Parameters
     ----------
     edges
         With ``forward`` and ``backward``; missing counts are none.
     options
-        The defaults where it is None: nine drives one way, and none the other, make an edge one-way.
+        None takes the defaults: nine drives one way, and none the other, make an edge one-way.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def counted_direction(edges: pd.DataFrame, *, options: DirectionOptions | None =
 
 
 def driving_direction(edges: pd.DataFrame) -> pd.Series:
-    """Say which way each edge may be driven: 1 from u to v only, -1 from v to u only, 0 both ways.
+    """Return the driving direction of each edge: 1 from u to v only, -1 from v to u only, 0 for both.
 
     The column ``oneway`` decides where it says something (see `told_direction`): it holds what a map says, or what
     `probe2road.refinement.evidence` made of the drives. An edge whose drives were weighed there (it has a value of
@@ -224,7 +224,7 @@ def driving_direction(edges: pd.DataFrame) -> pd.Series:
 
 
 def in_driving_direction(edges: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    """Turn the edges that are open from v to u only, so that every one-way edge runs as it is driven.
+    """Reverse the edges that are open from v to u only, so that every one-way edge has its driving direction.
 
     Of a turned edge ``u`` and ``v`` change places, the line runs the other way, and so do the values of columns that
     come in pairs (``forward`` and ``backward``, ``lanes:left`` and ``lanes:right``); ``oneway`` says ``yes``, or 1
@@ -256,12 +256,12 @@ def in_driving_direction(edges: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
 
 
 def _other_side(name: str) -> str:
-    """Name the column that holds the same for the other direction, or side, of a line."""
+    """Return the name of the column that holds the same property for the other direction, or side, of a line."""
     return _SIDE.sub(lambda side: _SIDES[side[0]], name)
 
 
 def _turned_words(oneway: pd.Series) -> pd.Series:
-    """Say "as drawn" where a column says "against it", in its own words."""
+    """Replace the word for "against the line" by the word for "along the line", in the vocabulary of the column."""
     against = (told_direction(oneway) == -1).fillna(False).to_numpy(bool)
     if pd.api.types.is_numeric_dtype(oneway.dtype):
         return oneway.mask(against, 1)

@@ -1,4 +1,4 @@
-"""What a road graph says of single vehicles, and how to leave that out."""
+"""Disclosure: what a road graph reveals about single vehicles, and how to leave it out."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 
 def withhold(graph: RoadGraph, *, min_vehicles: int = 1, min_drives: int = 1) -> RoadGraph:
-    """Leave out the edges that few vehicles or few drives stand behind, before a graph is handed on.
+    """Remove the edges that only few vehicles or drives support, before a graph is passed on.
 
     An edge goes with all that is said of it: its line, speed and counts, the turns onto it and off it, and nodes that
     only such edges have. Turns that were driven fewer than ``min_drives`` or ``min_vehicles`` times go as well. What
@@ -77,7 +77,7 @@ def withhold(graph: RoadGraph, *, min_vehicles: int = 1, min_drives: int = 1) ->
 
 
 def _support(graph: RoadGraph, counted: pd.Series, column: str, fix: str) -> np.ndarray:
-    """Return the support of every edge, 0 where it has none; a graph without any cannot be asked."""
+    """Return the support of every edge, 0 if it has none; refuse a graph without support."""
     if column not in graph.edges:
         column = "support" if column == "drive_support" else column
     if column not in graph.edges or (counted.any() and graph.edges.loc[counted, column].isna().all()):

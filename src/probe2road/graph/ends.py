@@ -1,4 +1,4 @@
-"""The ends of edges: at which nodes they are, where they lie, and which way the edge leads from there.
+"""The ends of edges: their nodes, their positions, and the directions from there along the edges.
 
 An edge has two ends. End ``2 e`` is where edge row ``e`` starts, end ``2 e + 1`` where it stops, so that ``end // 2``
 is the edge and ``end ^ 1`` its other end. Functions here take tables and lines: `RoadGraph.ends` and
@@ -17,22 +17,22 @@ from numpy.typing import NDArray
 
 __all__ = ["EdgeEnds", "end_rows", "line_ends"]
 
-_NOWHERE = 1e-9  # m; what leads no farther than this has no direction
+_NOWHERE = 1e-9  # m; an edge that leads no farther than this has no direction
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeEnds:
-    """The two ends of each of E edges, in plan; rows are ends."""
+    """The two ends of each of E edges, in plan; one row for each end."""
 
     node: NDArray[np.int64]  # (2 E,) row of the node
     position: NDArray[np.float64]  # (2 E, 2) m
-    ahead: NDArray[np.float64]  # (2 E, 2) unit vector away from the node into the edge; 0 where the edge comes back
+    ahead: NDArray[np.float64]  # (2 E, 2) unit vector away from the node into the edge; 0 if the edge returns there
 
     @classmethod
     def from_lines(
         cls, lines: NDArray[Any], rows: NDArray[np.int64], *, reach: float, skip: float = 0.0, share: float = 1.0
     ) -> EdgeEnds:
-        """Measure the ends of lines whose nodes have some rows, shape ``(E, 2)``; the rest as for `line_ends`.
+        """Measure the ends of lines, given the rows of their nodes, shape ``(E, 2)``, as `line_ends` does.
 
         Examples
         --------
@@ -51,7 +51,7 @@ class EdgeEnds:
 
 
 def end_rows(nodes: pd.DataFrame, edges: pd.DataFrame) -> NDArray[np.int64]:
-    """Return the rows of the nodes at which edges start and stop, shape ``(E, 2)``; -1 for a node that is not there.
+    """Return the rows of the nodes at which edges start and stop, shape ``(E, 2)``; -1 for a missing node.
 
     Raveled, the rows are those of the ends by number.
 
@@ -67,7 +67,7 @@ def end_rows(nodes: pd.DataFrame, edges: pd.DataFrame) -> NDArray[np.int64]:
 def line_ends(
     lines: NDArray[Any], *, reach: float, skip: float = 0.0, share: float = 1.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where both ends of lines lie in plan, and the vectors that lead away from there along the lines.
+    """Return the positions of both ends of lines in plan, and vectors from there along the lines.
 
     Parameters
     ----------

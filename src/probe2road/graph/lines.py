@@ -1,4 +1,4 @@
-"""Lines of a map before they are a graph: one line for each street, cut where another line ends on it.
+"""Lines of a map before they become a graph: one line for each street, cut where another line ends on it.
 
 Maps in GIS files differ in two ways from a graph. Many have a line for each direction of a street: those are brought
 together. And in many a through road is drawn past the side streets that end on its vertices: it is cut there, as ways
@@ -26,7 +26,7 @@ _SAME_HEIGHT = 2.0  # m; an end that lies higher or lower than this is on anothe
 
 
 def one_line_each(lines: NDArray[np.object_], attributes: pd.DataFrame) -> tuple[NDArray[np.object_], pd.DataFrame]:
-    """Make one line of two that run through the same places in opposite directions.
+    """Replace two lines through the same places in opposite directions by one.
 
     The first of the two stays, with its attributes. Its ``oneway`` says that it is open both ways where the two were
     one-way in opposite directions. Lines drawn twice in the same direction are left as they are.
@@ -53,7 +53,7 @@ def one_line_each(lines: NDArray[np.object_], attributes: pd.DataFrame) -> tuple
     number = pd.factorize(np.concatenate([drawn, back]))[0]
     drawn, back = number[: len(lines)], number[len(lines) :]
     street = np.minimum(drawn, back)
-    # A ring that reads the same both ways is no pair; a second line in one direction is no opposite of the first.
+    # A ring that equals its own reverse is no pair, and two lines in the same direction are no opposites.
     table = pd.DataFrame({"street": street, "along": drawn <= back})
     rank = table.groupby(["street", "along"]).cumcount()
     table["pair"] = rank
@@ -64,7 +64,7 @@ def one_line_each(lines: NDArray[np.object_], attributes: pd.DataFrame) -> tuple
     first, second = partner["min"].to_numpy(), partner["max"].to_numpy()
     if "oneway" in attributes:
         told = told_direction(attributes["oneway"]).fillna(0).to_numpy(np.int64)
-        # Against the course of the second is along the first.
+        # Against the direction of the second line is along the first.
         open_both = (told[first] == 0) | (told[second] == 0) | (told[first] == told[second])
         attributes = attributes.assign(oneway=_opened(attributes["oneway"], first[open_both & (told[first] != 0)]))
     kept = np.ones(len(lines), bool)
@@ -74,7 +74,7 @@ def one_line_each(lines: NDArray[np.object_], attributes: pd.DataFrame) -> tuple
 
 
 def _opened(oneway: pd.Series, rows: NDArray[np.int64]) -> pd.Series:
-    """Say "both ways" in some rows, in the words of the column."""
+    """Set rows to "both directions", in the vocabulary of the column."""
     if not len(rows):
         return oneway
     numeric = pd.api.types.is_numeric_dtype(oneway.dtype)
@@ -84,7 +84,7 @@ def _opened(oneway: pd.Series, rows: NDArray[np.int64]) -> pd.Series:
 
 
 def cut_at_ends(lines: NDArray[np.object_], *, snap: float) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
-    """Cut lines at their inner vertices on which a line ends.
+    """Cut lines at the inner vertices at which other lines end.
 
     Parameters
     ----------

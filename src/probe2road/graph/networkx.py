@@ -1,4 +1,4 @@
-"""The tables of a road graph as a NetworkX graph of OSMnx's kind."""
+"""The tables of a road graph as a NetworkX graph in the form of OSMnx."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["present", "to_networkx"]
 
 
 def to_networkx(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame, turns: pd.DataFrame) -> nx.MultiDiGraph:
-    """Return the tables of a graph as OSMnx has its graphs: a ``MultiDiGraph`` in the metric CRS.
+    """Return the tables of a graph as an OSMnx ``MultiDiGraph`` in the metric CRS.
 
     An edge that is open both ways becomes two directed edges, the second with ``reversed`` true, its geometry
     turned and its counts swapped; one-way edges become one, in the direction in which they are driven (see
@@ -59,7 +59,7 @@ def to_networkx(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame, turns: pd.Data
         forward=edges["backward"],
         backward=edges["forward"],
     ).rename(columns={"u": "v", "v": "u"})
-    # Both directions of a loop join the same pair of nodes: the second needs a key of its own.
+    # Both directions of a loop join the same pair of nodes: the second needs another key.
     loop = (edges["u"] == edges["v"]).to_numpy() & two_way
     backward.loc[loop, "key"] += edges["key"].max() + 1 if loop.any() else 0
     for table in (edges.assign(reversed=False), backward[two_way]):
@@ -70,7 +70,7 @@ def to_networkx(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame, turns: pd.Data
 
 
 def _with_positions(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame) -> pd.DataFrame:
-    """Return the node table with what OSMnx wants to know of nodes, in place of the geometry."""
+    """Return the node table with the columns that OSMnx needs, instead of the geometry."""
     position = shapely.get_coordinates(nodes.geometry.to_numpy())
     lon, lat = transform(position[:, 0], position[:, 1], nodes.crs, WGS84)
     return pd.DataFrame(nodes.drop(columns="geometry")).assign(
@@ -79,7 +79,7 @@ def _with_positions(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame) -> pd.Data
 
 
 def present(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return rows as dictionaries of Python values, without what is missing."""
+    """Return rows as dictionaries of Python values, without missing values."""
     columns = {str(name): table[name].astype(object).tolist() for name in table}
     there = {str(name): table[name].notna().tolist() for name in table}
     return [{name: columns[name][row] for name in columns if there[name][row]} for row in range(len(table))]

@@ -68,17 +68,17 @@ class RoadGraph:
 
     @property
     def crs(self) -> CRS:
-        """Metric CRS of nodes and edges."""
+        """Return the metric CRS of nodes and edges."""
         return self.edges.crs
 
     @property
     def length(self) -> float:
-        """Total length of the edges, metres."""
+        """Return the total length of the edges, metres."""
         return float(self.edges["length"].sum())
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """Bounding box ``(left, bottom, right, top)``, metres; NaN for an empty graph."""
+        """Return the bounding box ``(left, bottom, right, top)``, metres; NaN for an empty graph."""
         left, bottom, right, top = self.edges.total_bounds
         return float(left), float(bottom), float(right), float(top)
 
@@ -88,13 +88,13 @@ class RoadGraph:
 
     @cached_property
     def end_rows(self) -> NDArray[np.int64]:
-        """Rows of ``nodes`` at which the edges start and stop, shape ``(E, 2)``; raveled, by number of the end."""
+        """Return the rows of ``nodes`` at which the edges start and stop, shape ``(E, 2)``; raveled, by end number."""
         rows = end_rows(self.nodes, self.edges)
         rows.setflags(write=False)
         return rows
 
     def ends(self, *, reach: float, skip: float = 0.0, share: float = 1.0) -> EdgeEnds:
-        """Return the nodes, places and directions of all edge ends, numbered as in `probe2road.graph.ends`.
+        """Return the nodes, positions and directions of all edge ends, numbered as in `probe2road.graph.ends`.
 
         They are measured once for each choice of lengths, and kept: their arrays cannot be written to.
 
@@ -122,7 +122,7 @@ class RoadGraph:
         return measured[lengths]
 
     def to_crs(self, crs: Any) -> RoadGraph:
-        """Return the graph in another metric CRS, lengths measured anew.
+        """Return the graph in another metric CRS, with lengths measured again.
 
         Raises
         ------
@@ -141,14 +141,14 @@ class RoadGraph:
         return to_networkx(self.nodes, self.edges, self.turns)
 
     def plot(self, column: str | None = None, *, ax: Axes | None = None, **style: Any) -> Axes:
-        """Draw the edges with matplotlib, as ``GeoDataFrame.plot`` does.
+        """Draw the edges with matplotlib, like ``GeoDataFrame.plot``.
 
         Parameters
         ----------
         column
-            Edge column to colour by; one colour where it is None.
+            Edge column to colour by; one colour if it is None.
         ax
-            Axes to draw into; a new figure where it is None.
+            Axes to draw into; a new figure if it is None.
         **style
             Further arguments of ``GeoDataFrame.plot``: ``color``, ``linewidth``, ``legend``, ``figsize`` and others.
 
@@ -167,7 +167,7 @@ class RoadGraph:
         return self.edges.plot(column, ax=ax, **style)
 
     def explore(self, **options: Any) -> Any:
-        """Show the graph as a page to move about in: in the notebook, or else in the web browser.
+        """Show the graph as an interactive page: in the notebook, or else in the web browser.
 
         Unlike the page of ``GeoDataFrame.explore``, this one needs no network.
 
@@ -181,13 +181,13 @@ class RoadGraph:
         probe2road.draw.view.Page
             A notebook shows it; ``save`` writes it to a file.
         """
-        # Drawing stands far below graphs in the layers: take it through the front door, as the user would.
+        # The room for drawing is below this one: it is called through the public interface, as a user would.
         import probe2road
 
         return probe2road.draw.view.explore(self, **options)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the tables alone for pickling and copying: what was measured of them is quickly measured again."""
+        """Return the tables alone for pickling and copying, because measured properties are quickly computed again."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def __repr__(self) -> str:
@@ -203,7 +203,7 @@ class RoadGraph:
 
 
 def empty_graph(crs: Any) -> RoadGraph:
-    """Return the graph without roads, with every column in its type.
+    """Return a graph without roads, with every column in its type.
 
     Examples
     --------
@@ -270,7 +270,7 @@ def graph_from_lines(
     node_of_end, position = _joined(ends, snap)
     u, v = node_of_end.reshape(-1, 2).T
     geometry = move_ends(geometry, position[u], position[v])
-    kept = shapely.length(geometry) > 0  # a chain of joined ends can swallow a short line whole
+    kept = shapely.length(geometry) > 0  # when ends are joined, a short line can become a point
     geometry, line, u, v = geometry[kept], line[kept], u[kept], v[kept]
 
     nodes = gpd.GeoDataFrame(
@@ -284,7 +284,7 @@ def graph_from_lines(
 
 
 def _single_lines(lines: Sequence[Any] | NDArray[Any], shortest: float) -> tuple[NDArray[Any], NDArray[np.int64]]:
-    """Flatten to an array of LineStrings with extent, and the position of the line each one came from."""
+    """Return an array of LineStrings that are not points, and the position of the line that each one comes from."""
     geometry = np.empty(len(lines), dtype=object)
     for position, line in enumerate(lines):
         geometry[position] = line if line is None or isinstance(line, shapely.Geometry) else shapely.LineString(line)
@@ -294,7 +294,7 @@ def _single_lines(lines: Sequence[Any] | NDArray[Any], shortest: float) -> tuple
 
 
 def _joined(ends: NDArray[np.float64], snap: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Give line ends that belong together one number, in the order of first appearance.
+    """Give line ends at the same place one number, in the order of first appearance.
 
     Strategy: most ends that belong together are equal to the last bit, so equal ends are counted as one place
     first, by hashing. Places within ``snap`` of each other are then linked through a k-d tree, and the

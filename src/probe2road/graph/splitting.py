@@ -1,4 +1,4 @@
-"""Splitting: edges cut at places on them."""
+"""Splitting of edges at places on them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["led_to", "split_edges"]
 def split_edges(
     graph: RoadGraph, edge: NDArray[np.int64], along: NDArray[np.float64], *, merge: float = 0.0
 ) -> tuple[RoadGraph, NDArray[np.int64]]:
-    """Cut edges at places on them.
+    """Cut edges at places on them, and return the new graph.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def _with_parts(graph: RoadGraph, cuts: pd.DataFrame) -> RoadGraph:
 
 
 def _turns_of_parts(graph: RoadGraph, last: dict[int, int]) -> pd.DataFrame:
-    """Give turns at the end of a cut edge the id of its last part; those at its start keep theirs."""
+    """Give turns at the end of a cut edge the id of its last part; turns at its start keep their id."""
     turns = graph.turns.copy()
     stop = graph.edges["v"]
     for column in ("from_edge", "to_edge"):
@@ -108,7 +108,7 @@ def _turns_of_parts(graph: RoadGraph, last: dict[int, int]) -> pd.DataFrame:
 
 
 def led_to(line: shapely.LineString, cut: NDArray[np.float64], goals: list[shapely.Point | None]) -> shapely.LineString:
-    """Cut lengths off both ends of a line and lead it to points, where there are any; heights at the ends stay."""
+    """Cut lengths off both ends of a line, and connect the new ends to points, if given; heights at the ends stay."""
     kept = list(substring(line, cut[0], line.length - cut[1]).coords)
     for goal, at in zip(goals, (0, len(kept)), strict=True):
         if goal is not None:

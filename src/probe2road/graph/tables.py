@@ -1,4 +1,4 @@
-"""The tables of a road graph: their columns, and how edges and turns are brought into the contract.
+"""The tables of a road graph: their columns, and how edge and turn tables are made to fit the contract.
 
 This stands below `probe2road.graph.roadgraph`: functions here take and return tables, not graphs.
 """
@@ -69,13 +69,13 @@ def edges_with_turns(edges: gpd.GeoDataFrame, turns: pd.DataFrame) -> gpd.GeoDat
 
 
 def degrees(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame) -> pd.Series:
-    """Count the edge ends at every node, indexed like the nodes; a loop counts twice."""
+    """Return the number of edge ends at every node, indexed like the nodes; a loop counts twice."""
     ends = pd.concat([edges["u"], edges["v"]]).value_counts()
     return ends.reindex(nodes.index, fill_value=0).rename("degree").astype("int64")
 
 
 def finish_edges(edges: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    """Bring an edge table into the contract: keys and lengths computed, absent columns filled, types set.
+    """Complete an edge table: keys and lengths are computed, missing columns filled, and types set.
 
     Needs ``u``, ``v`` and ``geometry``; the index becomes ``edge``. Further columns are kept, behind ours.
     """
@@ -109,7 +109,7 @@ def move_ends(lines: NDArray[Any], first: NDArray[np.float64], last: NDArray[np.
 
 
 def without_unknown_heights(lines: NDArray[Any]) -> NDArray[Any]:
-    """Bring lines into the plane whose every height is NaN, as a table with one geometry type has them."""
+    """Convert lines whose every height is NaN to two dimensions: a table with one geometry type has such lines."""
     if not shapely.has_z(lines).any():
         return lines
     coordinates, owner = shapely.get_coordinates(lines, include_z=True, return_index=True)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 __all__ = ["Topology", "chains", "contract_short_edges", "end_nodes", "joined_lines", "mates"]
 
-_FADE = 1.5  # times the distance of two contracted nodes; within it edges are led straight to the new node
+_FADE = 1.5  # times the distance of two contracted nodes, within which edges lead straight to the new node
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,13 @@ def end_nodes(u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def mates(u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return, per end, the other end at its node where the node joins exactly two edges, else -1."""
+    """Return, for each end, the other end at its node if the node joins exactly two edges, else -1."""
     node = end_nodes(u, v)
     order = np.argsort(node, kind="stable")
     heads = np.flatnonzero(np.diff(node[order], prepend=-1))
     pairs = heads[np.diff(np.append(heads, len(order))) == 2]
     one, other = order[pairs], order[pairs + 1]
-    distinct = one // 2 != other // 2  # the two ends of a loop have nothing to join
+    distinct = one // 2 != other // 2  # the two ends of a loop are not joined
     mate = np.full(len(node), -1)
     mate[one[distinct]], mate[other[distinct]] = other[distinct], one[distinct]
     return mate
@@ -74,7 +74,7 @@ def mates(u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.int64]:
 
 @njit(cache=True)
 def chains(mate: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.int64]]:
-    """Walk every chain of mated ends in the direction of its first edge.
+    """Follow every chain of mated ends, in the direction of its first edge.
 
     Returns the members chain by chain, whether each is passed backwards, and where each chain starts.
     """
@@ -128,7 +128,7 @@ def joined_lines(
 def contract_short_edges(
     network: Topology, *, max_length: float, max_ring: float
 ) -> tuple[Topology, NDArray[np.int64]]:
-    """Contract edges between two junctions that are at most ``max_length`` long, shortest first.
+    """Contract edges between two junctions that are at most ``max_length`` long, the shortest first.
 
     Edges on a ring with a perimeter of more than ``2 max_length`` up to ``max_ring`` are left alone; a smaller
     ring is a hole in the mask and vanishes with its edges. Returns the network and, per node row, the row of
@@ -145,7 +145,7 @@ def contract_short_edges(
 
 
 def _lengths(network: Topology) -> NDArray[np.float64]:
-    """Length of every edge in plan."""
+    """Return the length of every edge in plan."""
     step = np.hypot(*np.diff(network.vertices[:, :2], axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(step)])
     return along[network.offsets[1:] - 1] - along[network.offsets[:-1]]
@@ -183,7 +183,7 @@ def _ring_lengths(
     order: NDArray[np.int64],
     limit: float,
 ) -> NDArray[np.float64]:
-    """Perimeter of the smallest ring through each candidate edge, infinite beyond the limit (Dijkstra).
+    """Return the length of the smallest ring through each candidate edge, infinity beyond the limit (Dijkstra).
 
     ``order[first[n] : first[n + 1]]`` are the ends at node n.
     """
@@ -215,20 +215,23 @@ def _ring_lengths(
 def _contracted(
     network: Topology, length: NDArray[np.float64], short: NDArray[np.int64], hole: float
 ) -> tuple[Topology, NDArray[np.int64]]:
-    """Contract edges that share no node, each to the weighted middle of its nodes."""
-    a, b = np.minimum(network.u[short], network.v[short]), np.maximum(network.u[short], network.v[short])
+    """Contract edges without common nodes, each to the weighted mean of its nodes."""
+    ends = np.stack([network.u[short], network.v[short]])
+    kept_node, merged_node = ends.min(axis=0), ends.max(axis=0)
     weight, position = network.weight.copy(), network.position.copy()
-    position[a] = (weight[a, None] * position[a] + weight[b, None] * position[b]) / (weight[a] + weight[b])[:, None]
-    weight[a] += weight[b]
+    weighted = weight[:, None] * position
+    total = (weight[kept_node] + weight[merged_node])[:, None]
+    position[kept_node] = (weighted[kept_node] + weighted[merged_node]) / total
+    weight[kept_node] += weight[merged_node]
     moved_to, radius = np.arange(len(position)), np.zeros(len(position))
-    moved_to[b] = a
-    radius[a] = _FADE * np.hypot(*(network.position[a] - network.position[b]).T)
+    moved_to[merged_node] = kept_node
+    radius[kept_node] = _FADE * np.hypot(*(network.position[kept_node] - network.position[merged_node]).T)
 
     partner = np.full(len(position), -1)
-    partner[a], partner[b] = b, a
+    partner[kept_node], partner[merged_node] = merged_node, kept_node
     contracted = np.full(len(position), np.inf)
-    contracted[a], contracted[b] = length[short], length[short]
-    # What else joins the two nodes is a side of a hole, or becomes a loop.
+    contracted[kept_node], contracted[merged_node] = length[short], length[short]
+    # Another edge between the two nodes is the side of a hole, or becomes a loop.
     kept = ~((partner[network.u] == network.v) & (length + contracted[network.u] <= hole))
     kept[short] = False
     u, v = moved_to[network.u], moved_to[network.v]
@@ -248,7 +251,7 @@ def _contracted(
 
 
 def _without_flat_edges(network: Topology) -> Topology:
-    """Leave out edges that have lost all extent: loops without a vertex besides their node."""
+    """Remove edges that have lost all extent: loops with no vertex except their node."""
     fine = _lengths(network) > 0
     if fine.all():
         return network
@@ -273,7 +276,7 @@ def _rehung(
     position: NDArray[np.float64],
     radius: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Lead the kept edges to where their nodes are now; vertices and offsets.
+    """Connect the kept edges to the new positions of their nodes; return vertices and offsets.
 
     Where a node has a radius, what an edge does inside it is replaced by the straight line from the node to
     where the edge leaves the circle, so that the shift fades out within the circle. Loops only move their ends.
@@ -305,7 +308,7 @@ def _copy_part(
     stop: NDArray[np.float64],
     out: NDArray[np.float64],
 ) -> int:
-    """Write start, the part of a line between two places, and stop; return how many vertices these are.
+    """Write start, the part of a line between two places, and stop; return the number of vertices written.
 
     The ends keep their heights. Where the places have passed each other, only the ends are left.
     """
@@ -330,7 +333,7 @@ def _copy_part(
 
 @njit(cache=True)
 def _exit(line: NDArray[np.float64], centre: NDArray[np.float64], radius: float) -> float:
-    """Where a line first leaves a circle around its start: vertex number and fraction; its last vertex if never."""
+    """Return where a line first leaves a circle around its start: vertex and fraction; its last vertex if never."""
     if radius == 0.0:
         return 0.0
     for place in range(len(line) - 1):
@@ -349,6 +352,6 @@ def _exit(line: NDArray[np.float64], centre: NDArray[np.float64], radius: float)
 
 @njit(cache=True)
 def _point_at(line: NDArray[np.float64], place: float) -> NDArray[np.float64]:
-    """Interpolate a line at a vertex number with a fraction."""
+    """Interpolate a line at a vertex plus a fraction of the segment after it."""
     before = min(int(place), len(line) - 2)
     return line[before] + (place - before) * (line[before + 1] - line[before])

@@ -1,4 +1,4 @@
-"""Atomic output: a file or folder that probe2road writes is complete or absent, never half there.
+"""Atomic output: a file or folder written by probe2road is complete or absent, never partial.
 
 What is being written lies in a hidden folder beside its target, ``.NAME.HOST-PROCESS-RANDOM.p2r-part``. A process
 that is killed leaves that folder behind; the name says whose it was, so that the next write of the same target can
@@ -54,7 +54,7 @@ _open_workshops: set[Path] = set()  # of this process
 
 @contextmanager
 def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
-    """Give a place to write to that becomes ``path`` when the block ends without an error.
+    """Yield a temporary path that becomes ``path`` when the block ends without an error.
 
     The place has the same name, and so the same suffix, in a hidden folder beside ``path``: on the same file
     system, which makes the final move atomic. Whatever a library leaves next to its file (journals, locks)
@@ -100,7 +100,7 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def atomic_paths(paths: Sequence[str | PathLike[str]]) -> Iterator[list[Path]]:
-    """Give places to write files to that belong together: all of them become ``paths`` when the block ends, or none.
+    """Yield temporary paths for files that belong together: at the end of the block, all become ``paths``, or none.
 
     Only the first has to be written; where another is not, what was there before is removed. If the block raises, or
     the process is killed before the last file is complete, all stay as they were. A process that is killed later
@@ -158,7 +158,7 @@ def atomic_paths(paths: Sequence[str | PathLike[str]]) -> Iterator[list[Path]]:
 
 
 def settled(path: str | PathLike[str]) -> Path:
-    """Return where a file is to be read that `atomic_paths` may have written; ends what a killed process began.
+    """Return where a file of `atomic_paths` can be read, after completing the work of a killed process.
 
     That is the path itself, but for a folder that takes no changes, in which a process was killed as it moved files
     into place.
@@ -180,7 +180,7 @@ def settled(path: str | PathLike[str]) -> Path:
 
 
 def _content_of(commit: Path) -> dict[str, list[str]]:
-    """Return what a commit says of itself; nothing where the folder is none of ours, or is gone by now."""
+    """Return the description of a commit; nothing if the folder is not ours, or is gone."""
     try:
         content = json.loads((commit / _CONTENT).read_text(encoding="utf-8"))
         return {"files": list(content["files"]), "removed": list(content["removed"])}
@@ -189,7 +189,7 @@ def _content_of(commit: Path) -> dict[str, list[str]]:
 
 
 def _finish(commit: Path) -> None:
-    """Move the files of a commit into place, as often as it takes: another process may do the same at this moment."""
+    """Move the files of a commit into place, repeatedly, because another process may do the same now."""
     content = _content_of(commit)
     if not content["files"]:
         return
@@ -205,7 +205,7 @@ def _finish(commit: Path) -> None:
 
 @contextmanager
 def _workshop(target: Path) -> Iterator[Path]:
-    """Give a hidden folder beside a target that is gone when the block ends, and speak of a full disk as such."""
+    """Yield a hidden folder beside a target that is removed when the block ends, and report a full disk as such."""
     if not target.parent.is_dir():
         raise OutputError(f"folder {target.parent} does not exist", where=target, fix="create it first")
     try:
@@ -235,7 +235,7 @@ def _workshop(target: Path) -> Iterator[Path]:
 
 
 def require_place(path: str | PathLike[str], *, folder: bool = False) -> None:
-    """Refuse an output that cannot be written where it is to go, before the work for it is done.
+    """Refuse an output path that cannot be written, before the work for it is done.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def require_place(path: str | PathLike[str], *, folder: bool = False) -> None:
 
 
 def _refusal_of_disk(folder: Path) -> str | None:
-    """Say why the disk takes nothing more, or None where it does: libraries hide the reason behind one of their own."""
+    """Return why the disk accepts no more data, or None; libraries hide the reason behind errors of their own."""
     probe = folder / "probe"
     try:
         with probe.open("wb") as file:
@@ -278,7 +278,7 @@ def _refusal_of_disk(folder: Path) -> str | None:
 
 
 def discard(folder: Path, name: str) -> None:
-    """Remove a folder beside a file in one step; what a kill leaves of it is swept by the next write of the file.
+    """Remove a folder beside a file in one step; after a kill, the next write of the file removes the rest.
 
     Parameters
     ----------
@@ -294,12 +294,12 @@ def discard(folder: Path, name: str) -> None:
 
 
 def is_workshop(path: Path) -> bool:
-    """Whether `atomic_path` made this folder, in whatever process."""
+    """Tell whether `atomic_path` made this folder, in any process."""
     return _OWNER.search(path.name) is not None
 
 
 def sweep_leftovers(folder: Path, name: str | None = None) -> None:
-    """Remove what killed processes left behind when they wrote into a folder.
+    """Remove the files that killed processes left when they wrote into a folder.
 
     Only folders that `atomic_path` made on this machine, and whose process is gone, are removed.
 
@@ -328,7 +328,7 @@ def sweep_leftovers(folder: Path, name: str | None = None) -> None:
 
 
 def _is_alive(process: int) -> bool:
-    """Whether another process of this number runs; this process knows its own workshops."""
+    """Tell whether another process with this number is running; this process knows its own workshops."""
     if process == os.getpid():
         return False
     try:
@@ -341,7 +341,7 @@ def _is_alive(process: int) -> bool:
 
 
 def _move(workshop: Path, target: Path) -> None:
-    """Move what was written in the workshop to its target."""
+    """Move the written output from the workshop to its target."""
     written = workshop / target.name
     if not written.exists():
         raise OutputError("nothing was written", where=target)
@@ -365,7 +365,7 @@ def _move(workshop: Path, target: Path) -> None:
 
 
 def _make_durable(written: Path) -> None:
-    """Have a file, or all of a folder, on the disk before its name is: a crash of the machine leaves old or new."""
+    """Write a file, or all of a folder, to the disk before it is renamed: after a crash, it is old or new."""
     for path in [*written.rglob("*"), written] if written.is_dir() else [written]:
         _sync(path)
 
@@ -379,7 +379,7 @@ def _sync(path: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder that output goes to, and those above it; one that is there stays as it is.
+    """Create an output folder and its parents; an existing folder stays as it is.
 
     Raises
     ------

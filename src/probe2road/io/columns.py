@@ -1,4 +1,4 @@
-"""Which column of a file is which: the user's map, the usual names, the units of time, the kinds of points.
+"""Which column of a file is which: the user's map, the usual names with or without a unit, the kinds of points.
 
 Nothing here guesses silently. What is taken from a usual name is returned with the rest and logged by the
 reader; where two columns would do, the reader asks.
@@ -7,9 +7,9 @@ reader; where two columns would do, the reader asks.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import groupby
 
 import numpy as np
 import pandas as pd
@@ -24,16 +24,14 @@ from probe2road.fleet.tables import (
     TRACE_OPTIONAL_COLUMNS,
 )
 from probe2road.io.formats import ColumnMap
+from probe2road.io.units import normal, unit_of, without_unit
 
 __all__ = [
     "KIND_SYNONYMS",
     "USUAL_NAMES",
     "ColumnChoice",
     "choose_columns",
-    "day_numbers",
     "standard_kinds",
-    "times_from_numbers",
-    "times_of_column",
 ]
 
 # Usual names per column of ours, in lower case with separators removed. Names before None are specific; those
@@ -41,30 +39,70 @@ __all__ = [
 USUAL_NAMES: dict[str, tuple[str | None, ...]] = {
     "trace_id": (
         *("traceid", "trip", "tripid", "drive", "driveid", "track", "trackid", "journey", "journeyid", "trace"),
-        *("traj", "trajid", "trajectory", "trajectoryid", "rideid", "sessionid", "routeid", None, "id"),
+        *("traj", "trajid", "trajectory", "trajectoryid", "rideid", "sessionid", "routeid", "trjid", "tripno"),
+        *("tripnumber", "tripcode", "orderid", "activityid", "probeid", "runid", None, "id", "trackfid"),
     ),
     "t": (
         *("t", "timestamp", "time", "ts", "datetime", "gpstime", "gpstimestamp", "timestamputc", "timeutc", "utc"),
-        *("epoch", "unixtime", "eventtime", "timems", "timestampms", "timestampns", "tstamp", "datetimeutc"),
+        *("epoch", "unixtime", "eventtime", "tstamp", "datetimeutc", "unixtimestamp", "epochtime", "posixtime"),
         *("utctime", "utcdatetime", "gpsdatetime", "trackedat", "recordedat", "measuredat", "observedat", "sampledat"),
         *("capturedat", "reportedat", "loggedat", "fixtime", "loctime", "locationtime", "positiontime", "recordtime"),
-        *("recordedtime", None, "devicetime", "createdat", "servertime", "receivedat", "localtime", "date"),
+        *("recordedtime", "recorded", "pingtimestamp", "pingtime", "sampledate", "sampletime", "utctimestamp"),
+        *("timeofday", "logtime", "loggedtime", "recordedon", "recordtimestamp", "positiontimestamp", "isotime"),
+        *("hhmmss", "clock", "uhrzeit", "zeit", "zeitstempel", "hora", "fechahora", "dateandtime", "timestring"),
+        *("datetimestring", "dateutctime", "eventtimestamp", "locationtimestamp"),
+        *(None, "devicetime", "createdat", "servertime", "receivedat", "localtime", "localdatetime", "starttime"),
+        *("startdatetime", "pickupdatetime", None, "date", "gpsdate", "utcdate"),
     ),
-    "z": ("z", "alt", "altitude", "ele", "elevation", None, "height"),
+    "z": ("z", "alt", "altitude", "ele", "elevation", "elev", "gpsaltitude", "gpsalt", None, "height"),
     "vehicle_id": (
-        *("vehicleid", "vehicle", "vehid", "vin", "deviceid", "taxiid", "taxi", "busid", "bus", "cabid", "truckid"),
-        *("userid", "user", "driverid", "imei", "unitid", "agentid", None, "device", "uid"),
+        *("vehicleid", "vehicle", "veh", "vehid", "vin", "deviceid", "taxiid", "taxi", "busid", "bus", "cabid"),
+        *("truckid", "userid", "user", "driverid", "imei", "unitid", "agentid", "devid", "assetid", "carid"),
+        *("cab", "car"),
+        *("licenseplate", "licenceplate", "plate", "vehiclename", "devicename", "terminalid", "driver", "truck"),
+        *(None, "device", "uid", "participant"),
     ),
-    "heading": ("heading", "bearing", "course", "azimuth", "headingdeg"),
-    "speed": ("speed", "velocity", "speedms", "speedmps"),
+    "heading": (
+        *("heading", "bearing", "course", "azimuth", "gpsheading", "gpsbearing", "gpscourse", "courseoverground"),
+        *("cog", "trueheading"),
+    ),
+    "speed": (
+        *("speed", "velocity", "gpsspeed", "groundspeed", "speedoverground", "sog", "gpsvelocity", "vehiclespeed"),
+        *("velocitysmooth",),
+    ),
     "accuracy": ("accuracy", "horizontalaccuracy", "haccuracy", "hacc", "gpsaccuracy", "positionaccuracy"),
     "kind": ("kind", "class", "classname", "featuretype", "objecttype", None, "label", "type", "category"),
 }
 _NOT_ASKED = ("vehicle_id", "heading", "speed", "accuracy")
-_DAY_STEP = 0.01  # days between fixes, at most; also seconds, which no receiver beats
-_LON_LAT = (("lon", "lng", "long", "longitude", "gpslon", "gpslongitude"), ("lat", "latitude", "gpslat", "gpslatitude"))
+_LON_LAT = (
+    (
+        *("lon", "lng", "long", "longitude", "gpslon", "gpslng", "gpslong", "gpslongitude", "rawlng", "rawlon"),
+        *("locationlon", "locationlng", "locationlong", "locationlongitude", "decimallongitude", "wgs84lon"),
+        *("lonwgs84"),
+        *("coordslongitude", "longitud", "laengengrad", "längengrad"),
+    ),
+    (
+        *("lat", "latitude", "gpslat", "gpslatitude", "rawlat", "locationlat", "locationlatitude", "decimallatitude"),
+        *("wgs84lat", "latwgs84", "coordslatitude", "lati", "latitud", "breitengrad"),
+    ),
+)
 _PROJECTED = (("x", "easting", "east", "utmx", "utmeasting"), ("y", "northing", "north", "utmy", "utmnorthing"))
-_GEOMETRY = ("geometry", "geom", "wkbgeometry", "position")
+_GEOMETRY = (
+    *("geometry", "geom", "wkbgeometry", "position", "polyline", "wkt", "thegeom", "linestring", "coordinates"),
+    *("wktgeom", "geomwkt", "geometrywkt", "shape"),
+)
+# Columns that complete one of ours: the date of a time of day, and the hemisphere of degrees without sign.
+_BESIDE = {
+    "t": ("date", "gpsdate", "utcdate", "dateutc", "localdate", "datestamp", "recorddate", "tripdate", "datum", "day"),
+    "x": (
+        *("ew", "ewindicator", "eastwest", "eorw", "londir", "lonew", "longitudeew", "longitudedir", "lonref"),
+        *("longituderef", "lonhemisphere", "longitudehemisphere", "longitudedirection", "londirection", "lonhemi"),
+    ),
+    "y": (
+        *("ns", "nsindicator", "northsouth", "nors", "latdir", "latns", "latitudens", "latitudedir", "latref"),
+        *("latituderef", "lathemisphere", "latitudehemisphere", "latitudedirection", "latdirection", "lathemi"),
+    ),
+}
 
 # What else the two kinds of semantic points are called, in lower case with separators removed.
 KIND_SYNONYMS: dict[str, tuple[str, ...]] = {
@@ -87,6 +125,13 @@ class ColumnChoice:
     guessed: tuple[str, ...]  # our names that were found under another, usual name
     degrees: bool  # the coordinates are longitude and latitude by name
     by_name: tuple[str, ...] = ()  # our names that the user did not give, whatever they are called in the file
+    units: Mapping[str, str] = field(default_factory=dict)  # our names to the units in the file's names
+    beside: Mapping[str, str] = field(default_factory=dict)  # t to a column of dates, x and y to their hemispheres
+
+    @property
+    def wanted(self) -> list[str]:
+        """The file's columns to read, each once."""
+        return list(dict.fromkeys([*self.columns.values(), *self.beside.values()]))
 
 
 def choose_columns(
@@ -105,7 +150,8 @@ def choose_columns(
     there
         Column names of the file.
     given
-        Our name to the file's, as the user said; an empty name means that the file has no such column.
+        Our name to the file's, as the user said; an empty name means that the file has no such column, and
+        ``date+time`` that the times stand in two.
     points
         Whether the file holds semantic points rather than traces.
     geometry
@@ -141,7 +187,8 @@ def choose_columns(
     """
     ours = (*POINT_COLUMNS, *POINT_OPTIONAL_COLUMNS) if points else (*TRACE_COLUMNS, *TRACE_OPTIONAL_COLUMNS)
     there = list(dict.fromkeys(there))
-    named = _given_columns(there, given or {}, (*ours, "geometry"), where)
+    given, dates = _split_times(there, given or {})
+    named = _given_columns(there, given, (*ours, "geometry"), where)
     left_out = {name for name, theirs in named.items() if not theirs}
     chosen = {name: theirs for name, theirs in named.items() if theirs}
     argument = "point_columns" if points else "columns"
@@ -157,7 +204,10 @@ def choose_columns(
         raise InputError.from_faults(faults, where=where)
     ordered = {name: chosen[name] for name in (*ours, "geometry") if name in chosen}
     guessed = tuple(name for name, theirs in ordered.items() if name not in named and name != theirs)
-    return ColumnChoice(ordered, guessed, degrees, tuple(name for name in ordered if name not in named))
+    by_name = tuple(name for name in ordered if name not in named)
+    units = {name: unit_of(theirs, name, _names(name)) for name, theirs in ordered.items()}
+    known = {name: unit for name, unit in units.items() if unit is not None}
+    return ColumnChoice(ordered, guessed, degrees, by_name, known, dates or _columns_beside(ordered, there, degrees))
 
 
 def standard_kinds(values: pd.Series) -> pd.Series:
@@ -170,94 +220,29 @@ def standard_kinds(values: pd.Series) -> pd.Series:
     """
     known = {synonym: kind for kind, synonyms in KIND_SYNONYMS.items() for synonym in synonyms}
     codes, found = pd.factorize(values, use_na_sentinel=False)
-    standard = [kind if kind in POINT_KINDS else known.get(_plain(str(kind)), kind) for kind in found]
+    standard = [kind if kind in POINT_KINDS else known.get(without_unit(str(kind), "kind"), kind) for kind in found]
     return pd.Series(np.array(standard, object)[codes], name=values.name)
 
 
-def times_from_numbers(values: pd.Series) -> tuple[pd.Series, str]:
-    """Convert times in seconds, milliseconds, microseconds or nanoseconds since 1970, by their magnitude.
-
-    Times before the year 5138 in one unit are smaller than those after 1973 in the next, so that the median
-    decides; smaller numbers, such as seconds since midnight, count as seconds.
-
-    Returns
-    -------
-    (Series, str)
-        UTC times (NaT where the number is missing) and the unit found. A column of anything but numbers comes
-        back as it is, without unit; numbers too large for a time come back in seconds, to be refused later.
-
-    Examples
-    --------
-    >>> times, unit = times_from_numbers(pd.Series([1577836800000, 1577836800200]))
-    >>> unit, str(times[1])
-    ('ms', '2020-01-01 00:00:00.200000+00:00')
-    """
-    if (dates := _written_dates(values)) is not None:
-        return dates
-    if pd.api.types.is_bool_dtype(values.dtype) or not pd.api.types.is_numeric_dtype(values.dtype):
-        return values, ""
-    numbers = values.to_numpy(dtype=np.float64, na_value=np.nan)
-    middle = float(np.nanmedian(np.abs(numbers))) if np.isfinite(numbers).any() else 0.0
-    unit = "s" if middle < 1e11 else "ms" if middle < 1e14 else "us" if middle < 1e17 else "ns"
-    per_second = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[unit]
-    missing = np.isnan(numbers)
-    if np.nanmax(np.abs(numbers), initial=0.0) >= 9.2e9 * per_second:
-        return pd.Series(numbers / per_second), unit
-    if pd.api.types.is_integer_dtype(values.dtype) and not missing.any():
-        nanoseconds = values.to_numpy(np.int64) * (10**9 // per_second)
-    else:
-        # A float64 holds the seconds of this century to a microsecond at best: do not invent nanoseconds.
-        nanoseconds = np.round(np.where(missing, 0.0, numbers) * (1e6 / per_second)).astype(np.int64) * 1000
-        nanoseconds[missing] = np.iinfo(np.int64).min
-    return pd.Series(nanoseconds.view("datetime64[ns]")).dt.tz_localize("UTC"), unit
+def _split_times(there: Sequence[str], given: ColumnMap) -> tuple[ColumnMap, dict[str, str]]:
+    """Take a column of dates out of ``date+time``, unless a column is called so."""
+    theirs = given.get("t")
+    if not isinstance(theirs, str) or theirs in there or "+" not in theirs:
+        return given, {}
+    dates, _, times = theirs.partition("+")
+    if dates not in there:
+        return given, {}
+    return {**given, "t": times}, {"t": dates}
 
 
-def times_of_column(values: pd.Series, name: str, *, where: object = None) -> tuple[pd.Series, str]:
-    """Return what `times_from_numbers` does for a column of a file.
-
-    Raises
-    ------
-    InputError
-        If the numbers look like days, not seconds.
-    """
-    if day_numbers(values):
-        first = values.dropna().iloc[0]
-        fault = (
-            f"column {name!r} (t) holds no seconds since 1970: {first:.12g} looks like a day number of a spreadsheet"
-        )
-        raise InputError(fault, where=where, fix="write times as ISO 8601, such as 2024-05-01T08:00:00Z")
-    return times_from_numbers(values)
-
-
-def _written_dates(values: pd.Series) -> tuple[pd.Series, str] | None:
-    """Read numbers such as 20240501080000: dates written without separators. None where any is no such date."""
-    if not pd.api.types.is_integer_dtype(values.dtype) or values.dropna().empty:
-        return None
-    format = {12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}.get(len(str(values.dropna().iloc[0])))
-    if format is None:
-        return None
-    times = pd.to_datetime(values.astype("str"), format=format, errors="coerce", utc=True)
-    read = times.notna()
-    if not (read | values.isna()).all() or not times[read].dt.year.between(1980, 2099).all():
-        return None
-    return times, "yyyymmddHHMMSS"[: 12 if len(format) == 10 else 14]
-
-
-def day_numbers(values: pd.Series) -> bool:
-    """Say whether numbers look like days since 1899-12-30 with the time as fraction, as spreadsheets store times.
-
-    Seconds of a day are of the same size, but lie further apart.
-
-    Examples
-    --------
-    >>> day_numbers(pd.Series([45413.3333333, 45413.3334491])), day_numbers(pd.Series([45413.0, 45423.0]))
-    (True, False)
-    """
-    if not pd.api.types.is_float_dtype(values.dtype):
-        return False
-    steps = values.diff().abs()
-    steps = steps[steps > 0]
-    return bool(20_000 < values.median() < 80_000 and len(steps) and steps.median() < _DAY_STEP)
+def _columns_beside(chosen: Mapping[str, str], there: Sequence[str], degrees: bool) -> dict[str, str]:
+    """Find the columns that complete others: dates for times, hemispheres for degrees."""
+    found: dict[str, str] = {}
+    for ours, names in _BESIDE.items():
+        if ours in chosen and (degrees or ours == "t"):
+            free = [column for column in there if column not in chosen.values() and normal(column) in names]
+            found |= {ours: free[0]} if free else {}
+    return found
 
 
 def _given_columns(there: Sequence[str], given: ColumnMap, ours: Sequence[str], where: object) -> dict[str, str]:
@@ -286,15 +271,15 @@ def _position_columns(
     if "geometry" in chosen:
         return {"geometry": chosen["geometry"]}, False
     if "x" in chosen and "y" in chosen:
-        by_name = _plain(chosen["x"]) in _LON_LAT[0] and _plain(chosen["y"]) in _LON_LAT[1]
-        return {"x": chosen["x"], "y": chosen["y"]}, by_name
+        by_name = [_matching([chosen[axis]], axis, names) for axis, names in zip("xy", _LON_LAT, strict=True)]
+        return {"x": chosen["x"], "y": chosen["y"]}, all(by_name)
     if geometry is not None and "x" not in chosen and "y" not in chosen:
         return {"geometry": geometry}, False
     degrees_first = crs is None or crs.is_geographic
     partial: dict[str, str] = {}
     for names in (_LON_LAT, _PROJECTED) if degrees_first else (_PROJECTED, _LON_LAT):
         found = {
-            axis: [chosen[axis]] if axis in chosen else _best([usual], there)
+            axis: [chosen[axis]] if axis in chosen else _matching(there, axis, usual)
             for axis, usual in zip("xy", names, strict=True)
         }
         pair = {axis: columns[0] for axis, columns in found.items() if columns}
@@ -302,7 +287,7 @@ def _position_columns(
             faults += [_ambiguous(axis, columns, argument) for axis, columns in found.items() if len(columns) > 1]
             return pair, names is _LON_LAT
         partial = partial or pair
-    geometries = _best([_GEOMETRY], there)
+    geometries = _matching(there, "geometry", _GEOMETRY)
     return ({"geometry": geometries[0]} if len(geometries) == 1 else partial), False
 
 
@@ -324,10 +309,10 @@ def _usual(name: str, there: Sequence[str], argument: str, faults: list[str]) ->
     if name in there:
         return name
     names = USUAL_NAMES[name]
-    split = names.index(None) if None in names else len(names)
-    found = _best([names[:split], names[split + 1 :]], there)
+    tiers = [list(tier) for is_name, tier in groupby(names, lambda usual: usual is not None) if is_name]
+    found: list[str] = next(filter(None, (_matching(there, name, tier) for tier in tiers)), [])
     if len(found) > 1 and name in _NOT_ASKED:  # nobody is asked for what may be absent: the likelier name is taken
-        return min(found, key=lambda column: names.index(_plain(column)))
+        return min(found, key=lambda column: names.index(without_unit(column, name, _names(name))))
     if len(found) > 1:
         faults.append(_ambiguous(name, found, argument))
     return found[0] if found else None
@@ -342,21 +327,19 @@ def _missing_faults(missing: Collection[str], there: Sequence[str], argument: st
     return [f"{names}; say which, for example {example}"]
 
 
-def _best(tiers: Sequence[Sequence[str | None]], there: Sequence[str]) -> list[str]:
-    """Return the columns whose names are in the first tier that has any."""
-    for tier in tiers:
-        found = [column for column in there if _plain(column) in tier]
-        if found:
-            return found
-    return []
+def _matching(there: Sequence[str], ours: str, names: Collection[str | None]) -> list[str]:
+    """Return the columns with one of the names: those without a unit, or all others where there is none."""
+    usual = [name for name in names if name is not None]
+    found = [column for column in there if without_unit(column, ours, usual) in usual]
+    return [column for column in found if normal(column) in usual] or found
+
+
+def _names(ours: str) -> list[str]:
+    """Return all usual names of one of our columns, to which a unit may be glued."""
+    axes = {axis: (*_LON_LAT[number], *_PROJECTED[number]) for number, axis in enumerate("xy")}
+    return [name for name in (*USUAL_NAMES.get(ours, ()), *axes.get(ours, ())) if name is not None]
 
 
 def _ambiguous(name: str, found: Sequence[str], argument: str) -> str:
     example = f"{argument}={json.dumps({name: found[0]}, ensure_ascii=False)}"
     return f"column {name!r} could be {', '.join(found)}; say which, for example {example}"
-
-
-def _plain(name: str) -> str:
-    """Bring a name to lower case without separators, a namespace prefix, and a unit in brackets."""
-    without_unit = re.sub(r"[\[(][^\])]*[\])]\s*$", "", name) or name
-    return "".join(letter for letter in without_unit.lower().strip() if letter.isalnum())

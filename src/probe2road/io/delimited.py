@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import csv
-import gzip
 import json
 import logging
 import re
 import zlib
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
-from pyproj import CRS
 
 from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin, may_leave_out
-from probe2road.io.columns import ColumnChoice, choose_columns, standard_kinds, times_of_column
+from probe2road.io.cells import raw_table
+from probe2road.io.columns import ColumnChoice, choose_columns
 from probe2road.io.formats import FleetFormat
-from probe2road.io.sources import RawTable, SourceFile
-from probe2road.io.wkb import text_coordinates
+from probe2road.io.guard import parsing
+from probe2road.io.sources import RawTable, SourceFile, opened
 
 __all__ = ["read_text_table"]
 
@@ -31,10 +31,13 @@ _DELIMITERS = (",", ";", "\t", "|", " ")  # the earlier one where two are as fre
 _HEAD = 65536  # bytes looked at for the header
 _WORDS = pa.dictionary(pa.int32(), pa.string())  # few different values in many rows
 _PLAIN_INTEGER = re.compile(r"0|-?[1-9]\d{0,17}")
+_DECIMAL_COMMA = re.compile(r"(?<![\w.,])[+-]?\d+,\d+(?![\w.,])")
 _EXAMPLES_SHOWN = 3
 _COMMENTS = ("#", "//", "%")  # that lines above the table start with
 _LINES_PARSED = 20  # to find the delimiter
+_LEAST_TABLE = 3  # lines that make a table below a title
 _DATE = re.compile(r"\d{4}[-/.]?\d{2}[-/.]?\d{2}([T ]|$)|\d{1,2}[/.]\d{1,2}[/.]\d{4}")
+_EPOCH = re.compile(r"1\d{9}(?:\d{3})?(?:\.\d+)?")  # s or ms since 1970, of this century
 _NO_ID = (None, "", "NULL", "\\N")
 _NULLS = [*("", "NULL", "null", "Null", "NaN", "nan", "NA", "N/A", "n/a", "#N/A", "None", "\\N", "-", "NaT")]
 
@@ -43,7 +46,7 @@ class _Head(NamedTuple):
     """The top of a text file."""
 
     lines: list[str]  # the first lines that are neither blank nor comments above the table
-    n_above: int  # lines above the first of them
+    places: list[int]  # how many lines of the file are above each
     delimiter: str | None  # that the file states itself, as spreadsheets do in a line sep=;
     is_all: bool  # nothing follows the first line
 
@@ -76,25 +79,25 @@ def read_text_table(source: SourceFile, format: FleetFormat | None = None, *, po
     format = format or FleetFormat()
     head = _read_head(source)
     delimiter = format.delimiter or head.delimiter or _delimiter(head.lines)
+    head = _without_title(head, delimiter, source)
     names = _column_names(head, delimiter, source, header=format.header)
     if format.header and not format.columns_of(points=points):
         _refuse_data_as_names(names, head, source, points=points)
     choice = choose_columns(
         names, format.columns_of(points=points), points=points, crs=format.stated_crs, where=source.path
     )
-    skip = head.n_above + format.header
-    content = _parse(source, names, choice, delimiter, skip, format)
-    table, unit, crs = _our_columns(content, choice, source)
-    guessed = tuple(f"{name}={choice.columns[name]}" for name in choice.guessed)
-    named = {name: choice.columns.get(name, choice.columns.get("geometry", name)) for name in table}
-    origin = TableOrigin("points" if points else "traces", "line", skip + 1, named, choice.by_name)
-    return RawTable(table, crs, choice.degrees, origin, (*guessed, *([f"t in {unit}"] if unit else [])))
+    skip = head.places[0] + format.header
+    has_commas = delimiter != "," and any(_DECIMAL_COMMA.search(line) for line in head.lines[format.header :])
+    content = _parse(source, names, choice, delimiter, skip, format, has_commas=has_commas)
+    origin = TableOrigin("points" if points else "traces", "line", skip + 1)
+    with parsing(source.path, "a column cannot be read", fix="write the file again, or name other columns"):
+        return raw_table(content, choice, format, origin, identifiers=_identifiers, where=source.path)
 
 
 def _read_head(source: SourceFile) -> _Head:
     """Read the top of a text file."""
     try:
-        with gzip.open(source.path) if source.path.suffix.lower() == ".gz" else source.path.open("rb") as file:
+        with opened(source) as file:
             head = file.read(_HEAD)
     except (OSError, EOFError, zlib.error) as error:
         raise _broken(source, error) from error
@@ -112,7 +115,8 @@ def _read_head(source: SourceFile) -> _Head:
         elif text and not text.startswith(_COMMENTS):
             break
         n_above += 1
-    below = [line for line in lines[n_above : n_above + _LINES_PARSED] if line.strip()]
+    places = [place for place in range(n_above, min(len(lines), n_above + _LINES_PARSED)) if lines[place].strip()]
+    below = [lines[place] for place in places]
     if not below:
         raise InputError("the file holds no rows", where=source.path, fix="write it again")
     try:
@@ -120,18 +124,34 @@ def _read_head(source: SourceFile) -> _Head:
     except UnicodeDecodeError as error:
         raise InputError(f"the first line is not UTF-8 ({error})", where=source.path, fix="save it as UTF-8") from error
     texts = [line.decode("utf-8-sig", errors="replace") for line in below]
-    return _Head(texts, n_above, stated, len(texts) == 1 and len(head) < _HEAD)
+    return _Head(texts, places, stated, len(texts) == 1 and len(head) < _HEAD)
 
 
 def _delimiter(lines: list[str]) -> str:
-    """Return the delimiter that gives most lines the same number of fields, two or more."""
+    """Return the delimiter that gives most lines in a row the same number of fields, two or more."""
+    return max(_DELIMITERS, key=lambda delimiter: _table_in(_widths(lines, delimiter)))
 
-    def fit(delimiter: str) -> tuple[float, int]:
-        widths = [len(cells) for cells in csv.reader(lines, delimiter=delimiter, skipinitialspace=True)]
-        alike = sum(width == widths[0] for width in widths) if widths[0] > 1 else 0
-        return alike, widths[0]
 
-    return max(_DELIMITERS, key=fit)
+def _widths(lines: list[str], delimiter: str) -> list[int]:
+    """Return the number of fields of every line."""
+    return [len(cells) for cells in csv.reader(lines, delimiter=delimiter, skipinitialspace=True)]
+
+
+def _table_in(widths: list[int]) -> tuple[int, int]:
+    """Return the length and the width of the longest run of lines with the same number of fields, two or more."""
+    runs = ((len(list(run)), width) for width, run in groupby(widths))
+    return max(((length, width) for length, width in runs if width > 1), default=(0, 1))
+
+
+def _without_title(head: _Head, delimiter: str, source: SourceFile) -> _Head:
+    """Pass over what reports write above a table: lines with at most half of the fields of the lines that follow."""
+    widths = _widths(head.lines, delimiter)
+    length, usual = _table_in(widths)
+    first = next((number for number, width in enumerate(widths) if 2 * width > usual), 0)
+    if first == 0 or len(widths) != len(head.lines) or length < _LEAST_TABLE:
+        return head
+    logger.info("%s: passed over %d lines above the table", source.path, first)
+    return head._replace(lines=head.lines[first:], places=head.places[first:])
 
 
 def _refuse_data_as_names(names: list[str], head: _Head, source: SourceFile, *, points: bool) -> None:
@@ -141,6 +161,7 @@ def _refuse_data_as_names(names: list[str], head: _Head, source: SourceFile, *, 
     if len(numbers) + len(times) < max(2, 0.5 * len(names)):
         return
     fractions = [number for number in numbers if "." in names[number]]
+    times += [number for number in numbers if _EPOCH.fullmatch(names[number])]
     columns: dict[str, str] = {}
     example = ""
     if len(fractions) >= 2:
@@ -148,8 +169,9 @@ def _refuse_data_as_names(names: list[str], head: _Head, source: SourceFile, *, 
         first, second = float(names[x]), float(names[y])
         if abs(first) <= 90 < abs(second):
             x, y = y, x
-        others = [number for number in range(len(names)) if number not in (x, y, *times)]
-        found = [("trace_id", others[:1]), ("t", times[:1]), ("x", [x]), ("y", [y])]
+        before = [number for number in range(min(x, y)) if number not in times]
+        ids = [("vehicle_id", before[:1]), ("trace_id", before[1:2])] if len(before) > 1 else [("trace_id", before)]
+        found = [*ids, ("t", times[:1]), ("x", [x]), ("y", [y])]
         columns = {name: str(number) for name, place in found for number in place}
         degrees = max(abs(first), abs(second)) <= 180
         example = f', for example columns={json.dumps(columns)} crs="{"EPSG:4326" if degrees else "EPSG:32616"}"'
@@ -170,12 +192,14 @@ def _column_names(head: _Head, delimiter: str, source: SourceFile, *, header: bo
     cells = [cell.strip() for cell in next(csv.reader(head.lines[:1], delimiter=delimiter))]
     if not header:
         return [str(number) for number in range(len(cells))]
-    return cells
+    rows = head.lines[1:]
+    has_no_name = all(line.endswith(delimiter) for line in rows) and _table_in(_widths(rows, delimiter))[1]
+    return [*cells, ""] if has_no_name == len(cells) + 1 else cells  # every row ends with a delimiter, the names do not
 
 
 def _distinct_columns(names: list[str], choice: ColumnChoice, source: SourceFile) -> list[str]:
     """Return the file's names of the chosen columns, each once; refuse a name that several columns have."""
-    wanted = list(dict.fromkeys(choice.columns.values()))
+    wanted = choice.wanted
     repeated = [name for name in wanted if names.count(name) > 1]
     if repeated:
         raise InputError(f"several columns are called {', '.join(repeated)}", where=source.path, fix="rename them")
@@ -183,12 +207,22 @@ def _distinct_columns(names: list[str], choice: ColumnChoice, source: SourceFile
 
 
 def _parse(
-    source: SourceFile, names: list[str], choice: ColumnChoice, delimiter: str, skip: int, format: FleetFormat
+    source: SourceFile,
+    names: list[str],
+    choice: ColumnChoice,
+    delimiter: str,
+    skip: int,
+    format: FleetFormat,
+    *,
+    has_commas: bool,
 ) -> pa.Table:
     """Parse the chosen columns; rows that are too short or too long are left out, or reported if there are many."""
     wanted = _distinct_columns(names, choice, source)
     types: dict[str, pa.DataType] = {choice.columns["geometry"]: pa.string()} if "geometry" in choice.columns else {}
     types |= {choice.columns[name]: _WORDS for name in ("trace_id", "vehicle_id", "kind") if name in choice.columns}
+    # Digits of times stay as they are written: with leading zeros, and with the commas of a list.
+    if format.time_format is not None or (has_commas and "geometry" in choice.columns):
+        types |= {name: pa.string() for name in (choice.columns.get("t"), choice.beside.get("t")) if name is not None}
     ragged: list[Any] = []
 
     def note(row: Any) -> str:
@@ -204,6 +238,7 @@ def _parse(
             read_options=pyarrow.csv.ReadOptions(use_threads=False, column_names=numbers, skip_rows=skip),
             parse_options=pyarrow.csv.ParseOptions(delimiter=delimiter, invalid_row_handler=note),
             convert_options=pyarrow.csv.ConvertOptions(
+                decimal_point="," if has_commas else ".",
                 include_columns=[number_of[name] for name in wanted],
                 null_values=_NULLS,
                 column_types={number_of[name]: kind for name, kind in types.items()},
@@ -223,22 +258,6 @@ def _parse(
     if binary:
         raise InputError(f"column {', '.join(binary)} is not UTF-8", where=source.path, fix="save it as UTF-8")
     return content
-
-
-def _our_columns(content: pa.Table, choice: ColumnChoice, source: SourceFile) -> tuple[pd.DataFrame, str, CRS | None]:
-    """Rename the columns to ours, unpack points and read numeric times; the unit of those, and the points' CRS."""
-    table: dict[str, Any] = {}
-    unit, crs = "", None
-    for name, theirs in choice.columns.items():
-        if name == "geometry":
-            points, crs = text_coordinates(content.column(theirs), name=theirs, where=source.path)
-            table |= points
-            continue
-        values = _identifiers(content.column(theirs)) if name.endswith("_id") else content.column(theirs).to_pandas()
-        if name == "t":
-            values, unit = times_of_column(values, theirs, where=source.path)
-        table[name] = standard_kinds(values) if name == "kind" else values
-    return pd.DataFrame(table, copy=False), unit, crs
 
 
 def _identifiers(column: pa.ChunkedArray) -> pd.Series:

@@ -1,4 +1,4 @@
-"""What a file holds, in figures: fleet data or a road graph."""
+"""Descriptions of files in figures: fleet data or a road graph."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.formats import FleetFormat, GraphFormat
 from probe2road.io.graph_files import READABLE, read_graph
+from probe2road.io.layers import holds_fixes
+from probe2road.io.sources import FORMATS, format_of
 
 __all__ = ["describe_file", "describe_fleet", "describe_graph"]
 
@@ -46,7 +48,7 @@ def describe_file(
     Probe2RoadError
         If the file cannot be read as either.
     """
-    if _holds_graph(Path(path)):
+    if _holds_graph(Path(path), format.layer if format else None):
         return {"content": "road graph", **describe_graph(read_graph(path, format=graph_format))}
     return {"content": "fleet data", **describe_fleet(path, format=format)}
 
@@ -88,8 +90,8 @@ def describe_graph(graph: RoadGraph) -> dict[str, Any]:
     }
 
 
-def _holds_graph(path: Path) -> bool:
-    """Whether a file is one of a road graph: by its suffix, and for Parquet by its columns."""
+def _holds_graph(path: Path, layer: str | None) -> bool:
+    """Whether a file is one of a road graph: by its suffix, for Parquet by its columns, in GIS files by the layers."""
     name = path.name.lower()
     if name.endswith((".parquet", ".geoparquet")):
         import pyarrow.parquet as pq
@@ -98,6 +100,8 @@ def _holds_graph(path: Path) -> bool:
             return {"u", "v", "key"} <= set(pq.read_schema(path).names)
         except (OSError, ValueError):
             return False  # the fleet reader says what is wrong with it
+    if path.is_file() and path.suffix.lower() in FORMATS:
+        return {"layer": not holds_fixes(path, layer)}.get(format_of(path), False)
     return name.endswith(tuple(READABLE))
 
 

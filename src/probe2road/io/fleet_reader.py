@@ -20,11 +20,16 @@ from probe2road.fleet.contract import Fleet, fleet_from_checked
 from probe2road.fleet.tables import TableOrigin, check_points, check_traces
 from probe2road.fleet.trimming import trim_ends
 from probe2road.io.atomic import settled
+from probe2road.io.clocks import FIRST_YEAR, LAST_YEAR
 from probe2road.io.delimited import read_text_table
 from probe2road.io.fleet_writer import points_path
 from probe2road.io.formats import BBox, ColumnMap, FleetFormat, adjusted
 from probe2road.io.gpx import read_gpx
+from probe2road.io.layers import read_layer
+from probe2road.io.nmea import read_nmea
 from probe2road.io.parquet import inside, read_parquet
+from probe2road.io.plt import read_plt
+from probe2road.io.records import read_records
 from probe2road.io.sources import RawTable, SourceFile, find_sources
 
 __all__ = ["read_fleet", "read_fleet_files"]
@@ -45,9 +50,11 @@ _DAMAGE = (
     OSError,
     pa.ArrowException,
 )
+# Format of `probe2road.io.sources.FORMATS` to its reader.
+_TABLES = {"parquet": read_parquet, "text": read_text_table, "layer": read_layer, "records": read_records}
+_RECORDINGS = {"gpx": read_gpx, "nmea": read_nmea, "plt": read_plt}  # of one layout, and of traces only
 _ROW_NUMBERS = ("id",)  # columns that number traces in some files, and rows in others
 _FEW_ROWS = 3  # of so few, ids that all differ say nothing
-_FIRST_YEAR, _LAST_YEAR = 1985, 2100  # that drives with a satellite receiver may be from
 _FILES_SHOWN = 10  # files with faults named in one error
 
 
@@ -63,6 +70,9 @@ def read_fleet(
     bbox: BBox | None = None,
     delimiter: str | None = None,
     header: bool | None = None,
+    time_format: str | None = None,
+    interval: float | None = None,
+    layer: str | None = None,
     invalid: str | None = None,
     max_accuracy: float | None = None,
     max_speed: float | None = None,
@@ -70,8 +80,11 @@ def read_fleet(
     r"""Read traces, and semantic points where there are any, and check everything.
 
     Formats go by suffix: Parquet and GeoParquet (``.parquet``, ``.pq``, ``.geoparquet``), text tables
-    (``.csv``, ``.tsv``, ``.txt``, each also with ``.gz``) and GPX (``.gpx``, ``.gpx.gz``). A folder stands for
-    all of them in it and below; files called ``points`` or ``NAME.points`` are left out of the traces.
+    (``.csv``, ``.tsv``, ``.txt``, ``.log``), GPX (``.gpx``), logs of NMEA sentences (``.nmea``, or text that begins
+    with ``$G``), GeoLife's and OziExplorer's ``.plt``, JSON records (``.json``, ``.jsonl``), all text also with
+    ``.gz``, and layers of points in GIS files (``.gpkg``, ``.geojson``, ``.fgb``, ``.shp``). A folder stands for all of
+    them in it and below; files called ``points`` or ``NAME.points`` are left out of the traces, and GIS files and JSON
+    where anything else is there.
 
     Traces are told apart by their ids across all files. A file without ids is one trace called like the
     file, and in GPX every track segment is a trace called ``file/track/segment``.
@@ -82,7 +95,8 @@ def read_fleet(
         A file, a folder, or a sequence of them. Trace columns are those of `Fleet`; times are ISO 8601 text,
         timestamps, or numbers since 1970 in s, ms, us or ns (told by their size); without zone they are UTC.
     points
-        Semantic points, likewise (not GPX). Kinds may have the names in `probe2road.io.columns.KIND_SYNONYMS`.
+        Semantic points, likewise (tables and layers only). Kinds may have the names in
+        `probe2road.io.columns.KIND_SYNONYMS`.
     format
         The parameters below in one object, for example out of a TOML file; a parameter that is given, too, takes the
         place of its field. None leaves what the format says, and what a `FleetFormat` says by default.
@@ -102,6 +116,13 @@ def read_fleet(
         Of text tables; told from the first line where it is not given.
     header
         Whether text tables start with a line of names, as they do by default; without, the columns are called 0, 1, 2.
+    time_format
+        How times are written, for `datetime.datetime.strptime`, such as ``"%d.%m.%Y %H:%M:%S"``. Not needed for ISO
+        8601, for numbers, and where only one usual way of writing times fits.
+    interval
+        Seconds between the positions of a line that has only the time of its start.
+    layer
+        Of the fixes, in a GIS file with several layers of points.
     invalid
         What happens to rows without position, id or readable time, to lines of text with another number of fields, and
         to fixes that repeat a time at another place: ``"drop"`` leaves them out with a warning, ``"refuse"`` refuses
@@ -146,6 +167,9 @@ def read_fleet(
         bbox=bbox,
         delimiter=delimiter,
         header=header,
+        time_format=time_format,
+        interval=interval,
+        layer=layer,
         invalid=invalid,
         max_accuracy=max_accuracy,
         max_speed=max_speed,
@@ -182,7 +206,7 @@ def read_fleet(
 def _warn_of_times(times: pd.Series) -> None:
     """Warn of a fleet at a time before satellites, or that nobody has lived to see."""
     middle = times.dropna().median() if times.notna().any() else None
-    if middle is not None and not _FIRST_YEAR <= middle.year <= _LAST_YEAR:
+    if middle is not None and not FIRST_YEAR <= middle.year <= LAST_YEAR:
         logger.warning(
             "half of the times are before %s: in the year %d are no such drives; numbers count as seconds since 1970 "
             "if nothing else is told by their size, check the column of times",
@@ -247,14 +271,13 @@ def _read_all(source: Source, format: FleetFormat, *, points: bool) -> tuple[pd.
 
 
 def _read_one(file: SourceFile, format: FleetFormat, *, points: bool) -> RawTable:
-    """Read one file by the reader of its suffix."""
-    if file.format == "parquet":
-        return read_parquet(file, format, points=points)
-    if file.format == "text":
-        return read_text_table(file, format, points=points)
+    """Read one file by the reader of its format."""
+    if file.format in _TABLES:
+        return _TABLES[file.format](file, format, points=points)
     if points:
-        raise InputError("GPX holds no semantic points", where=file.path, fix="use a text table or Parquet")
-    return read_gpx(file)
+        what = f"{file.format.upper()} holds no semantic points"
+        raise InputError(what, where=file.path, fix="use a text table, Parquet or a layer")
+    return _RECORDINGS[file.format](file, invalid=format.invalid)
 
 
 def _crs_of(raw: RawTable, file: SourceFile, given: CRS | None) -> CRS:

@@ -1,4 +1,4 @@
-"""Writing fleet data: GeoParquet that reads back as it was."""
+"""Writing fleet data as GeoParquet, from which the same data are read back."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ROW_GROUP = 262_144  # rows; small enough that a bounding box skips some, large 
 
 
 def points_path(path: str | PathLike[str]) -> Path:
-    """Return where the semantic points of a fleet go: beside its traces, marked in the name.
+    """Return the path for the semantic points of a fleet: beside its traces, marked in the name.
 
     Examples
     --------
@@ -39,7 +39,7 @@ def points_path(path: str | PathLike[str]) -> Path:
 
 
 def require_fleet_suffix(path: str | PathLike[str]) -> None:
-    """Refuse a file name that `write_fleet` has no format for.
+    """Refuse a file name with a suffix that `write_fleet` cannot write.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def require_fleet_suffix(path: str | PathLike[str]) -> None:
 
 
 def write_fleet(fleet: Fleet, path: str | PathLike[str]) -> list[Path]:
-    """Write traces, and semantic points where there are any, as GeoParquet 1.1.
+    """Write the traces, and the semantic points if there are any, as GeoParquet 1.1.
 
     Positions are a geometry column of native points (a struct of ``x``, ``y`` and, where any is known, ``z``)
     in the fleet's CRS: readers skip row groups by its statistics, and nothing is rounded. Reading the files
@@ -100,7 +100,7 @@ def write_fleet(fleet: Fleet, path: str | PathLike[str]) -> list[Path]:
 
 
 def point_table(table: pd.DataFrame, axes: str = "xyz") -> pa.Table:
-    """Turn a table into Arrow, its positions into one column of native points as GeoParquet has them."""
+    """Convert a table to Arrow, with its positions as one column of native points, as GeoParquet requires."""
     coordinates = [pa.array(table[axis].to_numpy(np.float64), pa.float64(), from_pandas=False) for axis in axes]
     geometry = pa.StructArray.from_arrays(coordinates, fields=[pa.field(axis, pa.float64(), False) for axis in axes])
     columns = pa.Table.from_pandas(table.drop(columns=list("xyz")), preserve_index=False)
@@ -108,7 +108,7 @@ def point_table(table: pd.DataFrame, axes: str = "xyz") -> pa.Table:
 
 
 def with_geo(schema: pa.Schema, crs: Mapping[str, Any], bbox: Sequence[float] | None) -> pa.Schema:
-    """Return the schema of a `point_table` with the metadata that make a file of it GeoParquet 1.1."""
+    """Return the schema of a `point_table` with the metadata of GeoParquet 1.1."""
     heights = schema.field("geometry").type.num_fields == 3
     about: dict[str, Any] = {
         "encoding": "point",
@@ -122,7 +122,7 @@ def with_geo(schema: pa.Schema, crs: Mapping[str, Any], bbox: Sequence[float] | 
 
 
 def bounding_box(table: pd.DataFrame) -> list[float] | None:
-    """Return ``[left, bottom, right, top]`` of a table's positions, None where it has no rows."""
+    """Return ``[left, bottom, right, top]`` of a table's positions, None for a table without rows."""
     return None if table.empty else [float(value) for value in (*table[["x", "y"]].min(), *table[["x", "y"]].max())]
 
 

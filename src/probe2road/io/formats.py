@@ -31,7 +31,8 @@ class FleetFormat:
     Raises
     ------
     OptionError
-        If ``bbox`` is no box, ``delimiter`` not one character, ``trim_ends`` negative, or a limit no positive number.
+        If ``bbox`` is no box, ``delimiter`` not one character, ``time_format`` none, ``trim_ends`` negative, or a limit
+        no positive number.
     CRSError
         If pyproj cannot read a CRS.
 
@@ -52,6 +53,9 @@ class FleetFormat:
     bbox: BBox | None = None  # left, bottom, right, top in the CRS of the files; what is outside is not read
     delimiter: str | None = None  # of text tables; told from the first line where None
     header: bool = True  # whether text tables start with a line of names; else the columns are 0, 1, 2
+    time_format: str | None = None  # how times are written, for strptime; told from them where None
+    interval: float | None = None  # s between the positions of a line that has a start time only
+    layer: str | None = None  # of the fixes, in a GIS file of several
     outliers: OutlierOptions = field(default_factory=OutlierOptions)  # what no vehicle can have been at is left out
     trim_ends: float = 0.0  # m left out at both ends of every trace, in which somebody may live
     invalid: str | None = None  # rows without position or readable time: drop or refuse; None: drop up to 5 % of a file
@@ -68,11 +72,14 @@ class FleetFormat:
             raise OptionError(f"trim_ends is {self.trim_ends}", fix="use metres, 0 or more")
         if self.invalid not in (None, "drop", "refuse"):
             raise OptionError(f"invalid is {self.invalid!r}", fix="use drop or refuse, or leave it out")
-        for name in ("max_accuracy", "max_speed"):
+        for name in ("max_accuracy", "max_speed", "interval"):
             try:
                 object.__setattr__(self, name, fitted(getattr(self, name), Positive[float] | None, name))
             except MisfitError as misfit:
                 raise OptionError(misfit.what, fix=misfit.fix) from misfit
+        if self.time_format is not None and "%" not in self.time_format:
+            fix = "write it as strptime does, such as %d.%m.%Y %H:%M:%S"
+            raise OptionError(f"time_format {self.time_format!r} names no part of a time", fix=fix)
         _check_crs(self.crs, self.target_crs)
 
     @cached_property

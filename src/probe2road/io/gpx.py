@@ -1,4 +1,4 @@
-"""Traces from GPX 1.0 and 1.1, streamed: a file is never held in memory as a tree.
+"""Reading traces from GPX 1.0 and 1.1 as a stream: a file is never held in memory as a tree.
 
 Strategy: expat calls back at the elements of a track point; the texts of positions, heights and times are
 collected in lists and converted together at the end. Routes and waypoints are no drives and are passed over.
@@ -6,7 +6,7 @@ collected in lists and converted together at the end. Routes and waypoints are n
 
 from __future__ import annotations
 
-import gzip
+import logging
 import zlib
 from typing import Any
 from xml.parsers import expat
@@ -17,14 +17,18 @@ import pandas as pd
 from probe2road.crs import WGS84
 from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin
-from probe2road.io.sources import RawTable, SourceFile
+from probe2road.io.sources import RawTable, SourceFile, opened
 
 __all__ = ["read_gpx"]
+
+logger = logging.getLogger(__name__)
+
+_ANONYMOUS = "openstreetmap.org"  # creator of files with the points of many, whose own files it names otherwise
 
 _VALUES = {"ele": "z", "time": "t", "speed": "speed", "course": "heading"}  # children of a track point, at any depth
 
 
-def read_gpx(source: SourceFile) -> RawTable:
+def read_gpx(source: SourceFile, *, invalid: str | None = None) -> RawTable:
     """Read the track points of one GPX file.
 
     Every track segment is a trace, called ``name of the file/number of the track/number of the segment``,
@@ -34,6 +38,8 @@ def read_gpx(source: SourceFile) -> RawTable:
     ----------
     source
         File with suffix ``.gpx`` or ``.gpx.gz``.
+    invalid
+        ``"refuse"`` also refuses a file in which only some points are anonymous.
 
     Returns
     -------
@@ -43,7 +49,8 @@ def read_gpx(source: SourceFile) -> RawTable:
     Raises
     ------
     InputError
-        If the XML is broken (with the line), the file is no GPX, or it has no track points.
+        If the XML is broken (with the line), the file is no GPX, it has no track points, or only anonymous ones of the
+        OpenStreetMap server, which are no drive.
     """
     lists = _parse(source)
     if not lists["lon"]:
@@ -58,17 +65,44 @@ def read_gpx(source: SourceFile) -> RawTable:
         if values.count(None) < len(values):
             table[name] = pd.Series(values, dtype=object) if tag == "time" else _numbers(values)
     columns = {"x": "lon", "y": "lat", "z": "ele", "t": "time", "heading": "course"}
-    return RawTable(pd.DataFrame(table), WGS84, True, TableOrigin("traces", "track point", 0, columns))
+    return RawTable(
+        _drives(pd.DataFrame(table), lists, source, invalid),
+        WGS84,
+        True,
+        TableOrigin("traces", "track point", 0, columns),
+    )
+
+
+def _drives(table: pd.DataFrame, lists: dict[str, list[Any]], source: SourceFile, invalid: str | None) -> pd.DataFrame:
+    """Leave out what is no drive: points without time that the OpenStreetMap server gives in no order."""
+    untimed = table["t"].isna() if "t" in table else pd.Series(True, table.index)
+    untimed = untimed.groupby(table["trace_id"], sort=False).transform("all")
+    if not any(_ANONYMOUS in creator.lower() for creator in lists["creator"]):
+        if untimed.any():
+            logger.warning(
+                "%s: %d of %d track points have no time and count as driven in their order; points of many vehicles, "
+                "as an anonymous download gives them, are no drive: leave them out",
+                *(source.path, int(untimed.sum()), len(table)),
+            )
+        return table
+    if not untimed.any():
+        return table
+    fault = f"{int(untimed.sum())} of {len(table)} track points of the OpenStreetMap server are anonymous, no drive"
+    if untimed.all() or invalid == "refuse":
+        fix = "they have no times and no order: download traces that are identifiable or trackable"
+        raise InputError(fault, where=source.path, fix=fix)
+    logger.warning("%s: %s: left out", source.path, fault)
+    return table[~untimed].reset_index(drop=True)
 
 
 def _parse(source: SourceFile) -> dict[str, list[Any]]:
     """Return the texts of all track points, and the numbers and first points of their segments."""
-    lists: dict[str, list[Any]] = {name: [] for name in ("lon", "lat", *_VALUES, "segment", "start")}
+    lists: dict[str, list[Any]] = {name: [] for name in ("lon", "lat", *_VALUES, "segment", "start", "creator")}
     parser = expat.ParserCreate()
     parser.buffer_text = True
     _connect(parser, lists, source)
     try:
-        with gzip.open(source.path) if source.path.suffix.lower() == ".gz" else source.path.open("rb") as file:
+        with opened(source) as file:
             parser.ParseFile(file)
     except expat.ExpatError as error:
         fault = f"broken XML at line {error.lineno}, column {error.offset + 1}: {expat.ErrorString(error.code)}"
@@ -105,6 +139,8 @@ def _connect(parser: expat.XMLParserType, lists: dict[str, list[Any]], source: S
             state["segment"] = -1
         elif not state["root"] and tag != "gpx":
             raise InputError(f"the root element is <{name}>, not <gpx>", where=source.path, fix="check its suffix")
+        if not state["root"]:
+            lists["creator"].append(attributes.get("creator", ""))
         state["root"] = True
 
     def end(name: str) -> None:
@@ -121,7 +157,7 @@ def _connect(parser: expat.XMLParserType, lists: dict[str, list[Any]], source: S
 
 
 def _numbers(texts: list[str | None]) -> Any:
-    """Convert texts to float64, missing ones to NaN; the texts themselves where one is no number."""
+    """Convert texts to float64, missing ones to NaN; return the texts themselves if one is not a number."""
     try:
         return np.array(["nan" if text is None else text for text in texts], np.float64)
     except ValueError:

@@ -1,4 +1,4 @@
-"""The road graph for other programs: NetworkX and OSMnx, and files of every format by their suffix."""
+"""Reading and writing of road graphs: files of every format, chosen by the suffix."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Road graphs as NetworkX graphs of OSMnx's kind, and as GraphML."""
+"""Conversion of road graphs to and from NetworkX graphs in the form of OSMnx, and GraphML."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def to_networkx(graph: RoadGraph) -> nx.MultiDiGraph:
 
 
 def from_networkx(graph: nx.Graph, *, target_crs: Any = None) -> RoadGraph:
-    """Return the road graph of a NetworkX graph made by `to_networkx` or OSMnx.
+    """Return the road graph of a NetworkX graph that was made by `to_networkx` or OSMnx.
 
     Of a foreign graph, two directed edges with the same geometry become one edge open both ways. One that stands
     alone is one-way as it runs if its ``oneway`` says so, whichever way: the tag may be that of the way it was made
@@ -80,7 +80,7 @@ def from_networkx(graph: nx.Graph, *, target_crs: Any = None) -> RoadGraph:
 
 
 def _road_graph(graph: nx.Graph, *, target_crs: Any, where: object, no_crs: str) -> RoadGraph:
-    """Do what `from_networkx` does; errors name the place, and say what to do where there is no CRS."""
+    """Do the work of `from_networkx`; errors name the source, and the remedy for a missing CRS."""
     source = parse_crs(graph.graph["crs"], where=where) if "crs" in graph.graph else None
     if source is None:
         raise CRSError("has no CRS", where=where, fix=no_crs)
@@ -124,7 +124,7 @@ def _nodes_from_networkx(graph: nx.Graph, crs: Any, where: object) -> gpd.GeoDat
 
 
 def _drawn(table: pd.DataFrame, nodes: gpd.GeoDataFrame) -> NDArray[Any]:
-    """Return the geometry of every directed edge, straight where it has none."""
+    """Return the geometry of every directed edge; without one, a straight line."""
     position = nodes.get_coordinates().to_numpy()
     u, v = position[end_rows(nodes, table).T]
     straight = shapely.linestrings(np.stack([u, v], axis=1)) if len(table) else np.zeros(0, object)
@@ -135,7 +135,7 @@ def _drawn(table: pd.DataFrame, nodes: gpd.GeoDataFrame) -> NDArray[Any]:
 
 
 def _one_edge_per_id(edges: gpd.GeoDataFrame, where: object) -> gpd.GeoDataFrame:
-    """Undo the two directions of `to_networkx`: one row per ``edge``, turned back where only the reverse is there."""
+    """Undo the two directions of `to_networkx`: one row per ``edge``, reversed if only the reverse direction exists."""
     flags = edges.get("reversed", pd.Series(False, edges.index))
     if not flags.map(lambda flag: isinstance(flag, bool | np.bool_)).all():
         raise InputError("edges do not say whether they are reversed", where=where, fix="write it again")
@@ -155,7 +155,7 @@ def _one_edge_per_id(edges: gpd.GeoDataFrame, where: object) -> gpd.GeoDataFrame
 
 
 def _from_foreign(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame, where: object) -> RoadGraph:
-    """Make one edge of the two directions of a road in an OSMnx graph."""
+    """Join the two directions of each road in an OSMnx graph to one edge."""
     low, high = edges[["u", "v"]].min(axis=1), edges[["u", "v"]].max(axis=1)
     shape = shapely.to_wkb(shapely.normalize(edges.geometry.to_numpy()))
     twins = pd.DataFrame({"low": low, "high": high, "shape": shape})
@@ -182,14 +182,14 @@ def _from_foreign(nodes: gpd.GeoDataFrame, edges: gpd.GeoDataFrame, where: objec
 
 
 def _towards(lines: NDArray[Any], u: NDArray[np.float64]) -> NDArray[Any]:
-    """Turn lines that start nearer to their end node: undirected graphs do not keep the order."""
+    """Reverse lines that start nearer to their end node, because undirected graphs do not keep the order."""
     first, last = (shapely.get_coordinates(shapely.get_point(lines, end)) for end in (0, -1))
     turned = np.hypot(*(last - u).T) < np.hypot(*(first - u).T)
     return np.where(turned, shapely.reverse(lines), lines)
 
 
 def _single_value(value: Any) -> Any:
-    """Join a list of values, as OSMnx has them on simplified edges, the way OSM does."""
+    """Join a list of values, which OSMnx has on simplified edges, in the way of OSM."""
     return ";".join(map(str, value)) if isinstance(value, list | tuple | set) else value
 
 
@@ -210,7 +210,7 @@ def write_graphml(graph: RoadGraph, path: str | PathLike[str]) -> None:
 
 
 def _as_text(data: dict[str, Any]) -> dict[str, str | None]:
-    """Return attributes as text, geometry as WKT that holds every digit."""
+    """Return attributes as text, and geometry as WKT with all digits."""
     return {
         name: shapely.to_wkt(value, rounding_precision=-1) if isinstance(value, shapely.Geometry) else text_value(value)
         for name, value in data.items()
@@ -239,7 +239,7 @@ def read_graphml(path: str | PathLike[str], *, target_crs: Any = None) -> RoadGr
 
 
 def _typed_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Bring text attributes back to numbers, flags and geometry, column by column."""
+    """Convert text attributes to numbers, flags and geometry, column by column."""
     if not rows:
         return []
     table = pd.DataFrame(rows, index=pd.RangeIndex(len(rows)))
@@ -250,6 +250,6 @@ def _typed_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _lines_from_text(text: pd.Series) -> NDArray[Any]:
-    """Read WKT; an edge without any, which OSMnx leaves out on straight ones, gets None."""
+    """Read lines from WKT; an edge without WKT, which OSMnx omits for straight ones, gets None."""
     plain = text.astype(object)
     return np.asarray(shapely.from_wkt(plain.where(plain.notna(), None).to_numpy(object)), object)

@@ -1,4 +1,4 @@
-"""Road graphs from GIS files: our own, and reference networks of plain lines from anywhere.
+"""Reading road graphs from GIS files: our own, and reference networks of plain lines from other sources.
 
 A file that we wrote comes back as it was. Any other file of LineStrings becomes a reference graph: edges meet
 where the ends of lines meet, and further columns are kept.
@@ -108,7 +108,7 @@ def read_note(path: str | PathLike[str], name: str) -> str | None:
 def read_parquet_graph(
     path: str | PathLike[str], *, crs: Any = None, target_crs: Any = None, inner_junctions: bool = True
 ) -> RoadGraph:
-    """Read a graph from GeoParquet; nodes and turns are taken from the files beside it where they are.
+    """Read a graph from GeoParquet; nodes and turns are read from the files beside it if they exist.
 
     The parameters and errors are those of `read_vector_graph`.
     """
@@ -147,7 +147,7 @@ def graph_from_table(
     inner_junctions: bool = True,
     where: object,
 ) -> RoadGraph:
-    """Make a graph of a table of lines: our own edges as they were, any others as a reference graph.
+    """Make a graph from a table of lines: our own edges as they were, other lines as a reference graph.
 
     One-way edges run in their driving direction: a line whose ``oneway`` says that it is driven against its course
     is turned. Two lines of a reference that run through the same places in opposite directions are one edge. With
@@ -217,7 +217,7 @@ def _recorded_crs(path: Path) -> CRS | None:
 
 
 def _with_crs(table: gpd.GeoDataFrame, crs: Any, where: object) -> gpd.GeoDataFrame:
-    """Return the table with a CRS: its own, or the given one where it has none."""
+    """Return the table with a CRS: its own, or the given one if it has none."""
     if not isinstance(table, gpd.GeoDataFrame):
         raise InputError("holds no geometry", where=where, fix="give a file with road centrelines")
     if table.crs is not None:
@@ -230,13 +230,13 @@ def _with_crs(table: gpd.GeoDataFrame, crs: Any, where: object) -> gpd.GeoDataFr
 
 
 def _streets(table: gpd.GeoDataFrame) -> tuple[NDArray[Any], pd.DataFrame]:
-    """Return the lines of a file that is not ours, one for each street, with the columns to keep."""
+    """Return the lines of a foreign file, one for each street, with the columns to keep."""
     parts, row = shapely.get_parts(table.geometry.to_numpy(), return_index=True)
     lines = shapely.get_type_id(parts) == shapely.GeometryType.LINESTRING
     return one_line_each(parts[lines], _further_columns(table).iloc[row[lines]])
 
 
 def _further_columns(table: gpd.GeoDataFrame) -> pd.DataFrame:
-    """Return the columns to keep of a file that is not ours: none of them means what ours mean."""
+    """Return the columns of a foreign file to keep; columns with the names of ours have other meanings."""
     own = ["edge", "support", "score", "forward", "backward", "origin"]
     return pd.DataFrame(table.drop(columns=[table.geometry.name, *own], errors="ignore"))

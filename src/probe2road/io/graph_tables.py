@@ -1,4 +1,4 @@
-"""What crosses the border between a road graph and a file, whatever the format.
+"""Conversion of road graphs for files: checks and types that all formats share.
 
 Going out, tables are checked for what must not leave (ids of vehicles and traces, times) and brought into
 plain column types. Coming in, a graph is put together from a table of edges that carries our columns. Formats
@@ -62,7 +62,7 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f]")
 
 
 def outgoing(graph: RoadGraph, *, where: object) -> RoadGraph:
-    """Return the graph as it may leave: without private columns, in plain types, edges in order of id.
+    """Return the graph in the form for files: without private columns, in plain types, edges in order of id.
 
     One-way edges run in their driving direction.
 
@@ -97,7 +97,7 @@ def outgoing(graph: RoadGraph, *, where: object) -> RoadGraph:
 
 
 def _refuse_private(values: pd.Series, table: str, where: object) -> None:
-    """Refuse a column that may identify drives, or that no format can hold."""
+    """Refuse a column that may identify drives, or that no format can store."""
     is_time = pd.api.types.is_datetime64_any_dtype(values.dtype) or pd.api.types.is_timedelta64_dtype(values.dtype)
     if is_time or _PRIVATE_NAME.fullmatch(str(values.name)):
         raise OutputError(
@@ -117,7 +117,7 @@ def _refuse_private(values: pd.Series, table: str, where: object) -> None:
 
 
 def _uniform_dimension(lines: NDArray[Any]) -> NDArray[Any]:
-    """Give all lines a height where one has: NaN where unknown, which a layer with heights can hold."""
+    """Give all lines heights if one has heights: NaN for unknown ones, which a layer with heights can store."""
     if not shapely.has_z(lines).any():
         return lines
     coordinates, owner = shapely.get_coordinates(lines, include_z=True, return_index=True)
@@ -140,7 +140,7 @@ def graph_from_edge_table(
     turns: pd.DataFrame | None = None,
     where: object,
 ) -> RoadGraph:
-    """Put a graph together from edges that carry `OWN_COLUMNS`, in a metric CRS; one-way edges run as they are driven.
+    """Make a graph from edges with `OWN_COLUMNS`, in a metric CRS; one-way edges get their driving direction.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def graph_from_edge_table(
 
 
 def require_finite(table: gpd.GeoDataFrame, *, where: object) -> None:
-    """Refuse geometry with coordinates that are no numbers."""
+    """Refuse geometry with coordinates that are not finite."""
     coordinates, row = shapely.get_coordinates(table.geometry.to_numpy(), return_index=True)
     wrong = np.unique(row[~(np.abs(coordinates) < _FARTHEST).all(axis=1)])
     if len(wrong):
@@ -189,7 +189,7 @@ def require_finite(table: gpd.GeoDataFrame, *, where: object) -> None:
 
 
 def require_lines(table: gpd.GeoDataFrame, *, where: object) -> None:
-    """Refuse a table of our edges in which one is no line."""
+    """Refuse a table of our edges with a geometry that is not a line."""
     geometry = table.geometry.to_numpy()
     line = (shapely.get_type_id(geometry) == shapely.GeometryType.LINESTRING) & ~shapely.is_empty(geometry)
     if not line.all():
@@ -199,7 +199,7 @@ def require_lines(table: gpd.GeoDataFrame, *, where: object) -> None:
 
 
 def require_points(nodes: gpd.GeoDataFrame, *, where: object) -> None:
-    """Refuse a table of our nodes in which one has no place."""
+    """Refuse a table of our nodes with a missing position."""
     geometry = nodes.geometry.to_numpy()
     point = (shapely.get_type_id(geometry) == shapely.GeometryType.POINT) & ~shapely.is_empty(geometry)
     if not point.all():
@@ -246,7 +246,7 @@ def _nodes_from_ends(edges: gpd.GeoDataFrame) -> tuple[gpd.GeoDataFrame, gpd.Geo
 
 
 def text_value(value: Any) -> str | None:
-    """Return a value as text for a format that knows only text; None where it is missing.
+    """Return a value as text for a format that only stores text; None if it is missing.
 
     Control characters, which XML cannot hold, are left out.
 
@@ -261,7 +261,7 @@ def text_value(value: Any) -> str | None:
 
 
 def typed_column(text: pd.Series) -> pd.Series:
-    """Undo `text_value` on a column: numbers or flags where every value reads as one, else text."""
+    """Undo `text_value` for a column: numbers or flags if every value can be read as one, else text."""
     if text.dropna().isin(["True", "False"]).all():
         return text.map({"True": True, "False": False})
     try:

@@ -1,4 +1,4 @@
-"""A road graph to GIS files: GeoPackage, GeoParquet, FlatGeobuf and GeoJSON.
+"""Writing road graphs to GIS files: GeoPackage, GeoParquet, FlatGeobuf and GeoJSON.
 
 =============  ============================================  ===================  =========
 format         tables                                        coordinates          precision
@@ -80,7 +80,7 @@ def write_geopackage(graph: RoadGraph, path: str | PathLike[str], *, note: Mappi
 
 
 def write_geoparquet(graph: RoadGraph, path: str | PathLike[str]) -> None:
-    """Write the edges as GeoParquet 1.1 with a covering bounding box, nodes and turns in files beside it.
+    """Write the edges as GeoParquet 1.1 with a covering bounding box, and nodes and turns to files beside it.
 
     The three files become those of the new graph together, or not at all.
 
@@ -103,7 +103,7 @@ def write_geoparquet(graph: RoadGraph, path: str | PathLike[str]) -> None:
 
 
 def _digest(tables: Sequence[pd.DataFrame]) -> str:
-    """Return a digest of all that is in some tables; equal tables share it."""
+    """Return a digest of the content of some tables; equal tables have equal digests."""
     digest = hashlib.blake2b(digest_size=16)
     for table in tables:
         digest.update(json.dumps([str(name) for name in table]).encode())
@@ -210,7 +210,7 @@ def _plain_records(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _line_type(graph: RoadGraph) -> str:
-    """Name the layer's geometry type: a layer with heights says so."""
+    """Return the geometry type of the layer, which says whether there are heights."""
     return "LineString Z" if shapely.has_z(graph.edges.geometry.to_numpy()).any() else "LineString"
 
 

@@ -1,4 +1,4 @@
-"""The gate at which the errors of other libraries become ours.
+"""Conversion of errors of other libraries to ours.
 
 A damaged file can make GDAL, Arrow, osmium, expat, PROJ and pandas raise nearly anything. What parses a file stands
 under `parsing`; what is made of its content is validated, so that a defect of ours stays visible as one.
@@ -19,7 +19,7 @@ _LONGEST = 200  # characters of a foreign message that are of use
 
 @contextmanager
 def parsing(where: object, what: str, *, fix: str = "check that it is complete") -> Iterator[None]:
-    """Turn any error of another library in the block into one that names the file.
+    """Replace any error of another library in the block by one that names the file.
 
     Only for blocks that call parsers and convert what they gave. Warnings of the parsers are silenced: what they warn
     of is checked afterwards.
@@ -58,7 +58,7 @@ def parsing(where: object, what: str, *, fix: str = "check that it is complete")
 
 @contextmanager
 def located(where: object) -> Iterator[None]:
-    """Name the file in errors of ours that name no place, such as one about the CRS of what it holds.
+    """Add the file to errors of ours that name no place, such as an error about the CRS of its content.
 
     Examples
     --------
@@ -77,7 +77,7 @@ def located(where: object) -> Iterator[None]:
 
 
 def _short(error: Exception) -> str:
-    """Return the first line of a message, cut where it becomes useless; the kind of error where there is none."""
+    """Return the first line of a message, shortened if it is long; the type of the error if there is no message."""
     lines = str(error).strip().splitlines()
     text = lines[0] if lines else type(error).__name__
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

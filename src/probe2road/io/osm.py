@@ -69,7 +69,7 @@ _DECIMALS = 7  # of a degree, in every OSM file
 def read_osm(
     path: str | PathLike[str], *, target_crs: Any = None, highways: Collection[str] | None = DRIVABLE
 ) -> RoadGraph:
-    """Read the roads of an OSM extract (``.osm``, ``.osm.pbf`` and what else osmium reads).
+    """Read the roads of an OSM extract (``.osm``, ``.osm.pbf`` and other formats of osmium).
 
     Ways are split where they share a node, so that a bridge stays apart from the road below. Of a way that an extract
     cuts, the parts inside are kept; what an editor has marked for deletion is gone. Positions may stand at the nodes or
@@ -141,14 +141,14 @@ def _inside(ways: OsmWays, path: str | PathLike[str]) -> OsmWays:
 
 
 def _recorded_crs(path: str | PathLike[str]) -> CRS | None:
-    """Return the metric CRS in the header of a file of ours, None in one from elsewhere."""
+    """Return the metric CRS in the header of our own file, None for other files."""
     with osm_errors(path), osmium.io.Reader(str(path), osmium.osm.osm_entity_bits.NOTHING) as reader:
         generator = reader.header().get("generator")
     return parse_crs(generator.removeprefix(_GENERATOR), where=path) if generator.startswith(_GENERATOR) else None
 
 
 def _usable(ways: OsmWays) -> OsmWays:
-    """Drop nodes that a way names twice in a row, then areas and ways of fewer than two nodes."""
+    """Drop nodes that a way names twice in a row, then areas and ways with fewer than two nodes."""
     repeated = (np.diff(ways.refs, prepend=0) == 0) & (np.diff(ways.way, prepend=-1) == 0)
     ways = ways.select_vertices(~repeated)
     area = np.array([tags.get("area") == "yes" for tags in ways.tags], bool)
@@ -156,7 +156,7 @@ def _usable(ways: OsmWays) -> OsmWays:
 
 
 def _lines(ways: OsmWays, path: str | PathLike[str], owner: NDArray[np.int64], crs: CRS) -> NDArray[Any]:
-    """Draw lines through vertices, those in three dimensions whose every node has a height."""
+    """Make lines from vertices, in three dimensions if every node of the line has a height."""
     x, y = transform(ways.lon, ways.lat, WGS84, crs)
     heights = (read_json_heights if holds_osm_json(path) else read_heights)(path, ways)
     if not (np.isfinite(x) & np.isfinite(y)).all():
@@ -181,13 +181,13 @@ def _split_at_junctions(ways: OsmWays, target: CRS, path: str | PathLike[str]) -
 
 
 def _oneway(tags: pd.DataFrame) -> pd.Series:
-    """Return the oneway tag, with "yes" where it says nothing and the class or the junction implies it."""
+    """Return the oneway tag; without one, "yes" if the class or the junction implies it."""
     tag = tags.get("oneway", pd.Series(np.nan, tags.index, dtype="str"))
     return tag.mask(told_direction(tag).isna() & tagged_direction(tags).notna(), ONEWAY_TAGS[1])
 
 
 def _restored(ways: OsmWays, target: CRS, path: str | PathLike[str]) -> RoadGraph:
-    """Undo `write_osm`."""
+    """Return the graph that `write_osm` wrote."""
     if not ways.placed.all():
         raise InputError("some nodes of its ways are missing", where=path, fix="write it again")
     lines = _lines(ways, path, ways.way, target)
@@ -227,7 +227,7 @@ def write_osm(graph: RoadGraph, path: str | PathLike[str]) -> None:
 
 @contextmanager
 def _writer(path: Path, header: osmium.io.Header) -> Iterator[osmium.SimpleWriter]:
-    """Open a writer of osmium, and survive a disk that takes nothing more."""
+    """Open a writer of osmium, and report a full disk as such."""
     writer = osmium.SimpleWriter(str(path), header=header)
     try:
         yield writer

@@ -1,4 +1,4 @@
-"""Answers of Overpass in JSON, with the positions of nodes beside the ways or inside them."""
+"""Reading answers of Overpass in JSON, with the positions of nodes beside the ways or inside them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _DAMAGED = "cannot be read as an answer of Overpass"
 
 
 def holds_osm_json(path: str | PathLike[str]) -> bool:
-    """Say whether a file ``.json`` is an answer of Overpass rather than GeoJSON, by its beginning."""
+    """Tell whether a file ``.json`` is an answer of Overpass rather than GeoJSON, by its beginning."""
     if not str(path).lower().endswith("json"):
         return False
     with parsing(path, "cannot be read"), Path(path).open("rb") as file:
@@ -80,5 +80,5 @@ def _elements(path: str | PathLike[str]) -> list[dict[str, Any]]:
 
 
 def _position(place: Any) -> tuple[float, float]:
-    """Return ``(lon, lat)``; positions outside of a box that was asked for are null."""
+    """Return ``(lon, lat)``, null for a position outside the requested box."""
     return _NOWHERE if place is None or "lon" not in place else (float(place["lon"]), float(place["lat"]))

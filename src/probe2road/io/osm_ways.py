@@ -49,7 +49,7 @@ _NO_POSITION = 2_147_483_647  # what osmium has for a node that is not in the fi
 
 @dataclass(frozen=True)
 class OsmWays:
-    """Ways as they stand in a file, in its order; their vertices lie end to end.
+    """The ways of a file, in its order, with their vertices in flat arrays.
 
     Attributes
     ----------
@@ -74,33 +74,33 @@ class OsmWays:
 
     @property
     def n_nodes(self) -> NDArray[np.int64]:
-        """Vertices of each way, shape (ways,)."""
+        """Return the number of vertices of each way, shape (ways,)."""
         return np.bincount(self.way, minlength=len(self.ids))
 
     @property
     def placed(self) -> NDArray[np.bool_]:
-        """Whether the position of each vertex is known, shape (vertices,)."""
+        """Tell which vertices have a known position, shape (vertices,)."""
         return np.isfinite(self.lon)
 
     def tag_table(self, keys: Collection[str]) -> pd.DataFrame:
-        """Return the values of some tags, one row for each way; a key that no way has is no column."""
+        """Return the values of some tags, one row for each way; a key without any value is no column."""
         there = [key for key in keys if any(key in tags for tags in self.tags)]
         values = {key: [tags.get(key) for tags in self.tags] for key in there}
         return pd.DataFrame(values, index=pd.RangeIndex(len(self.ids)), dtype="str")
 
     def select_vertices(self, chosen: NDArray[Any]) -> OsmWays:
-        """Return the ways with the vertices of a mask, or of an array of rows; no way is left out."""
+        """Return all ways with only the vertices of a mask or an array of rows."""
         return replace(self, way=self.way[chosen], refs=self.refs[chosen], lon=self.lon[chosen], lat=self.lat[chosen])
 
     def select_ways(self, kept: NDArray[np.bool_]) -> OsmWays:
-        """Return some of the ways, by a mask of shape (ways,)."""
+        """Return the ways of a mask of shape (ways,)."""
         inside = self.select_vertices(kept[self.way])
         tags = [tags for tags, wanted in zip(self.tags, kept.tolist(), strict=True) if wanted]
         return replace(inside, ids=self.ids[kept], tags=tags, way=(np.cumsum(kept) - 1)[inside.way])
 
 
 def placed_parts(ways: OsmWays) -> OsmWays:
-    """Cut ways at vertices without a position: what is drawn between two of them stays, with the id and the tags.
+    """Cut ways at vertices without a position; the parts between them keep the id and the tags.
 
     An extract that was cut at a line holds the nodes inside only. No chord joins where a way leaves and comes back.
 
@@ -125,7 +125,7 @@ def placed_parts(ways: OsmWays) -> OsmWays:
 
 @dataclass(frozen=True)
 class WayParts:
-    """Ways cut where they meet; a vertex at which a way is cut is drawn twice.
+    """Ways cut where they meet; a vertex at which a way is cut appears twice.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class WayParts:
 
 
 def osm_errors(path: str | PathLike[str]) -> AbstractContextManager[None]:
-    """Turn the errors of osmium into ours; see `probe2road.io.guard.parsing`."""
+    """Convert the errors of osmium to ours; see `probe2road.io.guard.parsing`."""
     return parsing(path, "cannot be read as OSM data")
 
 
@@ -190,7 +190,7 @@ def read_ways(path: str | PathLike[str], highways: Collection[str] | None) -> Os
 
 
 def _with_inline_positions(ways: OsmWays, path: str | PathLike[str], wanted: Any) -> OsmWays:
-    """Fill in positions that stand at the references of ways, as ``out geom`` of Overpass and osmium write them."""
+    """Fill in positions at the node references of ways, which Overpass (``out geom``) and osmium can write."""
     if ways.placed.all():
         return ways
     x, y = [], []
@@ -208,7 +208,7 @@ def _with_inline_positions(ways: OsmWays, path: str | PathLike[str], wanted: Any
 
 
 def _marked_for_deletion(path: str | PathLike[str]) -> set[int]:
-    """Return the ids of ways that JOSM has marked for deletion in a file, which osmium does not see."""
+    """Return the ids of ways that JOSM has marked for deletion, which osmium does not report."""
     name = str(path).lower()
     opened = {".osm": open, ".gz": gzip.open, ".bz2": bz2.open}
     opener: Any = next((opener for suffix, opener in opened.items() if name.endswith(suffix)), None)
@@ -227,7 +227,7 @@ def _marked_for_deletion(path: str | PathLike[str]) -> set[int]:
 
 
 def _positions(path: str | PathLike[str]) -> osmium.NodeLocationsForWays:
-    """Return a filter that gives the nodes of a way their positions; nodes with negative ids get none."""
+    """Return a filter that gives nodes of ways their positions; nodes with negative ids get none."""
     positions = osmium.NodeLocationsForWays(osmium.index.create_map("flex_mem"))
     positions.ignore_errors()
     with osmium.io.Reader(str(path), osmium.osm.NODE) as reader:

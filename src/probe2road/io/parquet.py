@@ -16,10 +16,11 @@ from pyproj import CRS
 from probe2road.crs import parse_crs
 from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin
-from probe2road.io.columns import ColumnChoice, choose_columns, standard_kinds, times_of_column
+from probe2road.io.cells import raw_table
+from probe2road.io.columns import ColumnChoice, choose_columns
 from probe2road.io.formats import BBox, FleetFormat
+from probe2road.io.guard import parsing
 from probe2road.io.sources import RawTable, SourceFile
-from probe2road.io.wkb import point_coordinates
 
 __all__ = ["inside", "read_parquet"]
 
@@ -68,24 +69,15 @@ def read_parquet(source: SourceFile, format: FleetFormat | None = None, *, point
         )
         about = geo["columns"].get(choice.columns.get("geometry"), {}) if geo else {}
         condition = None if bbox is None else _row_filter(choice, about, dataset.schema, bbox)
-        wanted = list(dict.fromkeys(choice.columns.values()))
-        content, skipped = _read_groups(dataset, wanted, condition)
+        content, skipped = _read_groups(dataset, choice.wanted, condition)
     except (pa.ArrowException, UnicodeDecodeError, OSError) as error:
         reason = (str(error).splitlines() or [""])[0]
         fix = "it may be truncated; copy or write it again"
         raise InputError(f"not a readable Parquet file ({reason})", where=source.path, fix=fix) from error
-    try:
-        table, unit = _our_columns(content, choice, source)
-    except (pa.ArrowException, UnicodeDecodeError) as error:
-        reason = (str(error).splitlines() or [""])[0]
-        fault = f"a column cannot be read ({reason})"
-        raise InputError(fault, where=source.path, fix="write the file again, or name other columns") from error
     file_crs = _crs_of(about, source) if "geometry" in choice.columns and geo else None
-    guessed = tuple(f"{name}={choice.columns[name]}" for name in choice.guessed)
-    names = {name: choice.columns.get(name, choice.columns.get("geometry", name)) for name in table}
-    origin = TableOrigin("points" if points else "traces", columns=names, by_name=choice.by_name)
-    told = (*guessed, *([f"t in {unit}"] if unit else []))
-    return RawTable(table, file_crs, choice.degrees, origin, told, skipped)
+    origin = TableOrigin("points" if points else "traces")
+    with parsing(source.path, "a column cannot be read", fix="write the file again, or name other columns"):
+        return raw_table(content, choice, format, origin, crs=file_crs, skipped=skipped, where=source.path)
 
 
 def _read_groups(
@@ -144,6 +136,8 @@ def _row_filter(choice: ColumnChoice, about: Mapping[str, Any], schema: pa.Schem
     geometry = choice.columns.get("geometry")
     covering = about.get("covering", {}).get("bbox")
     if geometry is None:
+        if not _holds_plain_degrees(choice, schema):
+            return None
         x_min = x_max = ds.field(choice.columns["x"])
         y_min = y_max = ds.field(choice.columns["y"])
     elif pa.types.is_struct(schema.field(geometry).type):
@@ -156,19 +150,7 @@ def _row_filter(choice: ColumnChoice, about: Mapping[str, Any], schema: pa.Schem
     return (x_max >= left) & (x_min <= right) & (y_max >= bottom) & (y_min <= top)
 
 
-def _our_columns(content: pa.Table, choice: ColumnChoice, source: SourceFile) -> tuple[pd.DataFrame, str]:
-    """Rename the columns to ours, unpack the geometry and read numeric times; and the unit of those times."""
-    table: dict[str, Any] = {}
-    unit = ""
-    for name, theirs in choice.columns.items():
-        column = content.column(theirs)
-        if name == "geometry":
-            table |= point_coordinates(column, name=theirs, where=source.path)
-            continue
-        if pa.types.is_decimal(column.type) and not name.endswith("_id"):
-            column = column.cast(pa.float64())
-        values = column.to_pandas()
-        if name == "t":
-            values, unit = times_of_column(values, theirs, where=source.path)
-        table[name] = standard_kinds(values) if name == "kind" else values.reset_index(drop=True)
-    return pd.DataFrame(table, copy=False), unit
+def _holds_plain_degrees(choice: ColumnChoice, schema: pa.Schema) -> bool:
+    """Say whether coordinates are in the file as they are in the box, not as integers, in radians or without sign."""
+    as_they_are = all(pa.types.is_floating(schema.field(choice.columns[axis]).type) for axis in "xy")
+    return (as_they_are or not choice.degrees) and not {"x", "y"} & {*choice.units, *choice.beside}

@@ -1,9 +1,13 @@
-"""Which files to read, what format each has, and what its traces are called."""
+"""The files to read, the format of each, and the names of its traces."""
 
 from __future__ import annotations
 
+import gzip
+import re
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BufferedIOBase
 from os import PathLike
 from pathlib import Path
 
@@ -16,13 +20,24 @@ from probe2road.errors import InputError, MissingFileError
 from probe2road.fleet.tables import TableOrigin
 from probe2road.io.atomic import settled
 
-__all__ = ["FORMATS", "POINTS_MARK", "RawTable", "SourceFile", "find_sources"]
+__all__ = ["FORMATS", "POINTS_MARK", "RawTable", "SourceFile", "find_sources", "format_of", "opened"]
 
 FORMATS = {
     **dict.fromkeys((".parquet", ".pq", ".geoparquet"), "parquet"),
-    **dict.fromkeys((".csv", ".tsv", ".txt", ".csv.gz", ".tsv.gz", ".txt.gz"), "text"),
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".log", ".csv.gz", ".tsv.gz", ".txt.gz", ".log.gz"), "text"),
     **dict.fromkeys((".gpx", ".gpx.gz"), "gpx"),
+    **dict.fromkeys((".nmea", ".nmea.gz"), "nmea"),
+    **dict.fromkeys((".plt", ".plt.gz"), "plt"),
+    **dict.fromkeys((".gpkg", ".geojson", ".fgb", ".shp"), "layer"),
+    **dict.fromkeys((".json", ".jsonl", ".ndjson", ".json.gz"), "records"),
 }
+# What a file of a more general suffix is, by what its first bytes hold.
+_BEGINNINGS = {
+    "text": {rb"\$G": "nmea", rb"Geolife trajectory": "plt", rb"OziExplorer Track": "plt"},
+    "records": {rb'\{.*"type"\s*:\s*"FeatureCollection"': "layer", rb'\{.*"(osm3s|elements)"\s*:': "layer"},
+}
+_HEAD = 4096  # bytes looked at
+_ASKED_FOR = ("layer", "records")  # formats of maps as well: taken out of a folder only where nothing else is in it
 POINTS_MARK = "points"  # a file called points.SUFFIX or NAME.points.SUFFIX holds semantic points
 
 
@@ -37,7 +52,7 @@ class SourceFile:
 
 @dataclass(frozen=True)
 class RawTable:
-    """What is in a file, unchecked: our column names, the file's types."""
+    """The unchecked content of a file: our column names, the file's types."""
 
     table: pd.DataFrame
     crs: CRS | None  # that the file itself states
@@ -50,11 +65,11 @@ class RawTable:
 def find_sources(
     source: str | PathLike[str] | Sequence[str | PathLike[str]], *, semantic_points: bool = False
 ) -> tuple[list[SourceFile], list[Path]]:
-    """List the files of fleet data that a path stands for, in order of their names.
+    """List the files of fleet data in a path, sorted by name.
 
     A folder stands for all files in it, and in the folders below, that have a supported suffix and are not
     hidden (a name that starts with ``.`` or ``_``). Files of semantic points beside the traces, by name, are
-    left out of a folder of traces.
+    left out of a folder of traces, and so are GIS files and JSON, which may be maps, where anything else is in it.
 
     Parameters
     ----------
@@ -99,11 +114,32 @@ def find_sources(
             files.setdefault(_existing(settled(item)), _stem(Path(item.name)))
     if len(set(files.values())) < len(files):  # files of one name: call them by their whole paths
         files = {path: path.as_posix() for path in files}
-    return [SourceFile(path, FORMATS[_suffix(path)], name) for path, name in files.items()], left_out
+    return [SourceFile(path, format_of(path), name) for path, name in files.items()], left_out
+
+
+def opened(source: SourceFile) -> BufferedIOBase:
+    """Open a file to read its bytes, unpacked where its suffix is .gz."""
+    if source.path.suffix.lower() == ".gz":
+        return gzip.open(source.path)
+    return source.path.open("rb")
+
+
+def format_of(path: Path) -> str:
+    """Return the format of a file, by its suffix and, where that is general, by its first bytes."""
+    format = FORMATS[_suffix(path)]
+    if format not in _BEGINNINGS:
+        return format
+    try:
+        with opened(SourceFile(path, format, "")) as file:
+            head = file.read(_HEAD).removeprefix(b"\xef\xbb\xbf").lstrip()
+    except (OSError, EOFError, zlib.error):
+        return format  # whose reader says what is wrong
+    beginnings = _BEGINNINGS[format].items()
+    return next((found for pattern, found in beginnings if re.match(pattern, head, re.DOTALL)), format)
 
 
 def _existing(path: Path) -> Path:
-    """Return the path of a file that can be read."""
+    """Return the path of a file, or refuse one that cannot be read."""
     if not path.exists():
         raise MissingFileError("there is no such file or folder", where=path, fix="check the path")
     if _suffix(path) not in FORMATS:
@@ -120,11 +156,13 @@ def _supported_files(folder: Path) -> list[Path]:
         settled(place / "any")  # ends what a killed process began
     inside = (path for path in folder.rglob("*") if path.is_file() and _suffix(path) in FORMATS)
     seen = (path for path in inside if not any(part.startswith(hidden) for part in path.relative_to(folder).parts))
-    return [_existing(path) for path in sorted(seen)]
+    found = sorted(seen)
+    drives = [path for path in found if FORMATS[_suffix(path)] not in _ASKED_FOR]
+    return [_existing(path) for path in drives or found]
 
 
 def _is_marked(path: Path) -> bool:
-    """Say whether a file calls itself one of semantic points."""
+    """Tell whether the name of a file says that it contains semantic points."""
     return _stem(Path(path.name)).split(".")[-1].lower() == POINTS_MARK
 
 

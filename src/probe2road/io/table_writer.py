@@ -1,4 +1,4 @@
-"""A table to a file, in the format that its suffix names: CSV, Parquet, GeoParquet, GeoPackage, GeoJSON."""
+"""Writing of a table to a file, in the format of its suffix: CSV, Parquet, GeoParquet, GeoPackage, GeoJSON."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TIME = "%Y-%m-%dT%H:%M:%S.%fZ"
 
 
 def require_table_suffix(path: str | PathLike[str], suffixes: tuple[str, ...] = TABLE_SUFFIXES) -> str:
-    """Return the suffix of a path in lower case, if it is of a format that `write_table` writes.
+    """Return the suffix of a path in lower case, or refuse one that `write_table` cannot write.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def require_table_suffix(path: str | PathLike[str], suffixes: tuple[str, ...] = 
 
 
 def write_table(table: pd.DataFrame, path: str | PathLike[str], *, layer: str = "table") -> None:
-    r"""Write a table to a file, complete or not at all; the suffix decides on the format.
+    r"""Write a table to a file, complete or not at all; the suffix determines the format.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def write_table(table: pd.DataFrame, path: str | PathLike[str], *, layer: str = 
 
 
 def _plain(table: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    """Return the table in the column types that GDAL has."""
+    """Return the table with the column types of GDAL."""
     types = {}
     for name in table.columns.drop(table.geometry.name):
         if isinstance(table[name].dtype, pd.CategoricalDtype):

@@ -1,4 +1,4 @@
-"""What `probe2road.matching.match` is made of: states, observations, two hidden Markov models, tables."""
+"""Map matching: which edges of a road graph a fleet drove, with two hidden Markov models."""
 
 from pkgutil import iter_modules
 

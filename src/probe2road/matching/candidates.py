@@ -1,4 +1,4 @@
-"""Points on edges near a fix.
+"""Candidates: the points on edges near a fix.
 
 Strategy
 --------
@@ -21,7 +21,7 @@ __all__ = ["Scratch", "altitude_at", "nearest_on_edge", "nearest_points", "new_s
 
 
 class Scratch(NamedTuple):
-    """Work space of `nearest_points`, shape (P,) each; ``seen`` holds the last query that met a piece."""
+    """Work arrays of `nearest_points`, shape (P,) each; ``seen`` holds the last query that reached each piece."""
 
     seen: NDArray[np.int64]
     near: NDArray[np.int64]
@@ -32,7 +32,7 @@ class Scratch(NamedTuple):
 
 @njit(cache=True)
 def new_scratch(n_pieces: int) -> Scratch:
-    """Return the work space for a network of so many pieces."""
+    """Return work arrays for a network with the given number of pieces."""
     return Scratch(
         np.full(n_pieces, -1, np.int64),
         np.empty(n_pieces, np.int64),
@@ -44,7 +44,7 @@ def new_scratch(n_pieces: int) -> Scratch:
 
 @njit(cache=True)
 def nearest_points(states: States, x: float, y: float, radius: float, query: int, scratch: Scratch) -> int:
-    """Find the nearest point of every run of pieces within the radius, in the order of the pieces.
+    """Find the nearest point on every run of consecutive pieces within the radius, in the order of the pieces.
 
     Parameters
     ----------
@@ -66,17 +66,17 @@ def nearest_points(states: States, x: float, y: float, radius: float, query: int
     count = 0
     before = -2
     for k in range(near):
-        p = scratch.near[k]
-        share, squared = _project(states, p, x, y)
+        piece = scratch.near[k]
+        share, squared = _project(states, piece, x, y)
         distance = np.sqrt(squared)
-        new = p != before + 1 or states.edge[p] != states.edge[before]
+        new = piece != before + 1 or states.edge[piece] != states.edge[before]
         if new or distance < scratch.distance[count - 1]:
             if new:
                 count += 1
-            scratch.point[count - 1] = p
-            scratch.along[count - 1] = states.along[p] + share * states.size[p]
+            scratch.point[count - 1] = piece
+            scratch.along[count - 1] = states.along[piece] + share * states.size[piece]
             scratch.distance[count - 1] = distance
-        before = p
+        before = piece
     return count
 
 
@@ -121,7 +121,7 @@ def _sort(values: NDArray[np.int64], count: int) -> None:
 
 @njit(cache=True, inline="always")
 def _project(states: States, p: int, x: float, y: float) -> tuple[float, float]:
-    """Return the share of a piece at its point nearest to a place, and the squared distance to it."""
+    """Return the nearest point of a piece as a share of its length, and its squared distance."""
     to_x, to_y = x - states.x[p], y - states.y[p]
     dx, dy = states.dx[p], states.dy[p]
     squared = dx * dx + dy * dy
@@ -134,7 +134,7 @@ def _project(states: States, p: int, x: float, y: float) -> tuple[float, float]:
 
 @njit(cache=True, inline="always")
 def nearest_on_edge(states: States, edge: int, x: float, y: float, low: float, high: float) -> tuple[float, float]:
-    """Return the point of an edge between two offsets from u that is nearest to a place, and its distance."""
+    """Return the nearest point on an edge between two offsets from u, and its distance."""
     best_along, best = low, np.inf
     for p in range(states.piece_first[edge], states.piece_first[edge + 1]):
         if states.along[p] > high or states.along[p] + states.size[p] < low:

@@ -1,4 +1,4 @@
-"""From the chosen candidates of key fixes to matched paths: the edges driven, and the place of every fix on them.
+"""From the candidates chosen for key fixes to matched paths: the driven edges, and the position of every fix on them.
 
 Legend of array shapes: F fixes, T traces, S steps of all traces one after another.
 """
@@ -47,7 +47,7 @@ class Paths(NamedTuple):
 
 
 class _Steps(NamedTuple):
-    """Steps found so far; numba grows lists, not arrays."""
+    """The steps found so far, as lists, because numba can extend lists but not arrays."""
 
     state: list[int]
     trace: list[int]
@@ -57,7 +57,7 @@ class _Steps(NamedTuple):
 
 @njit(cache=True)
 def match_over_routes(problem: Problem, starts: NDArray[np.int64]) -> Paths:
-    """Match all traces; trace i has the fixes ``starts[i]`` to ``starts[i + 1]``."""
+    """Match all traces; trace i has the fixes ``starts[i]`` to ``starts[i + 1]`` (excluded)."""
     states, observed = problem.states, problem.observed
     n_fixes = len(observed.x)
     paths = Paths(
@@ -122,7 +122,7 @@ def _follow_route(
     problem: Problem, candidates: Candidates, chosen: NDArray[np.int64], k: int, labels: Labels,
     steps: _Steps, paths: Paths,
 ) -> None:  # fmt: skip
-    """Append the steps from the key before to key k, and place the fixes between them on the way."""
+    """Append the steps from the key fix before to key fix k, and place the fixes between them on the route."""
     states, observed = problem.states, problem.observed
     source, target = chosen[k - 1], chosen[k]
     first = len(steps.state) - 1
@@ -155,7 +155,7 @@ def _follow_route(
 def _driven_span(
     states: States, state: int, begin: float, end: float, is_first: bool, is_last: bool
 ) -> tuple[float, float]:
-    """Return the offsets from u, ascending, between which a directed edge was driven."""
+    """Return the offsets from u between which a directed edge was driven, the smaller first."""
     length = states.length[state >> 1]
     reverse = state & 1
     start, stop = (length, 0.0) if reverse else (0.0, length)
@@ -168,7 +168,7 @@ def _driven_span(
 
 @njit(cache=True)
 def _place_behind(problem: Problem, start: int, stop: int, steps: _Steps, paths: Paths) -> None:
-    """Place the fixes behind the last key fix of a part on its last edge, where they are within the radius."""
+    """Place the fixes after the last key fix of a part on its last edge, if they are within the radius."""
     states, observed, radius = problem.states, problem.observed, problem.parameters.radius
     step = len(steps.state) - 1
     edge = steps.state[step] >> 1

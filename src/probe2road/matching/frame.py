@@ -1,4 +1,4 @@
-"""Matched fleets in the frame of the edges: how far along and aside every fix is, and which stretches were driven.
+"""Matched fleets in the coordinates of edges: how far along and beside its edge every fix is, and what was driven.
 
 Strategy
 --------
@@ -40,7 +40,7 @@ __all__ = [
     "stations_along",
 ]
 
-_SIGMA_OF_MAD = 1.4826  # ratio of a normal law
+_SIGMA_OF_MAD = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 _SAME_PLACE = 0.01  # m
 
 
@@ -54,7 +54,7 @@ class EdgeLines:
     length: NDArray[np.float64]  # (E,) m, in plan
 
     def at(self, edge: NDArray[np.int64], along: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return positions ``(n, 3)`` and unit directions ``(n, 2)`` on edges, given by row and metres from u."""
+        """Return positions ``(n, 3)`` and unit directions ``(n, 2)`` at distances along edges (rows, m from u)."""
         along = self.along[self.first[edge]] + np.clip(along, 0.0, self.length[edge])
         # A vertex shared by two edges occurs twice at one distance: stay between the first and last piece of the edge.
         piece = np.searchsorted(self.along, along, side="right") - 1
@@ -68,7 +68,7 @@ class EdgeLines:
 
 @dataclass(frozen=True)
 class Traversals:
-    """T drives along an edge, in the order of the traces."""
+    """T traversals of an edge by a drive, in the order of the traces."""
 
     trace: NDArray[np.int64]  # (T,) number of the trace
     edge: NDArray[np.int64]  # (T,) row of the edge
@@ -89,7 +89,7 @@ class FramedFixes:
 
 @dataclass(frozen=True)
 class Stations:
-    """S places along edges, at equal distances from end to end of each."""
+    """S stations on edges, at equal distances from end to end of each edge."""
 
     first: NDArray[np.int64]  # (E + 1,)
     edge: NDArray[np.int64]  # (S,) row of the edge
@@ -107,7 +107,7 @@ class Stations:
         return (1 - share) * values[before] + share * values[before + 1]
 
     def bends(self, values: NDArray[np.float64], tolerance: float) -> NDArray[np.bool_]:
-        """Tell at which stations values ``(S,)`` bend, so that lines between those stay within a tolerance."""
+        """Tell at which stations values ``(S,)`` bend: lines between these stay within a tolerance of all values."""
         drawn = shapely.linestrings(np.column_stack([self.along, values]), indices=self.edge)
         kept, edge = shapely.get_coordinates(shapely.simplify(drawn, tolerance), return_index=True)
         needed = np.zeros(len(values), bool)
@@ -115,13 +115,13 @@ class Stations:
         return needed
 
     def nearest(self, edge: NDArray[np.int64], along: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the station nearest to places on edges."""
+        """Return the nearest station to places on edges."""
         number = np.rint(along / np.maximum(self.spacing[edge], 1e-9)).astype(np.int64)
         return self.first[edge] + np.clip(number, 0, np.diff(self.first)[edge] - 1)
 
 
 def edge_lines(graph: RoadGraph) -> EdgeLines:
-    """Lay out the vertices of all edges.
+    """Concatenate the vertices of all edges.
 
     Examples
     --------
@@ -140,7 +140,7 @@ def edge_lines(graph: RoadGraph) -> EdgeLines:
 
 
 def stations_along(length: NDArray[np.float64], spacing: float) -> Stations:
-    """Place stations on edges of given lengths (m), at most ``spacing`` (m) apart, at least the two ends.
+    """Place stations on edges of given lengths (m): at most ``spacing`` (m) apart, and always at both ends.
 
     Examples
     --------
@@ -157,7 +157,7 @@ def stations_along(length: NDArray[np.float64], spacing: float) -> Stations:
 def courses(
     lines: EdgeLines, stations: Stations, needed: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the vertices of edges with stations added: rows of edges, m from the start ``(n,)``, positions ``(n, 3)``.
+    """Return the vertices of edges and the stations: rows of edges, m from the start ``(n,)``, positions ``(n, 3)``.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def courses(
 
 
 def frame(graph: RoadGraph, fleet: Fleet, matches: Matches) -> tuple[Traversals, FramedFixes]:
-    """Bring a matched fleet into the frame of the edges.
+    """Return a matched fleet in the coordinates of the edges.
 
     A trace that was lost on an edge and found again on it, in the same direction, traversed it once.
 
@@ -264,7 +264,7 @@ def _dealt_out(
     step_edge: NDArray[np.int64],
     step_forward: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
-    """Give every fix its traversal: that of the fix before where it fits, else the next of the trace that does."""
+    """Assign a traversal to every fix: that of the fix before if it fits, else the next of the trace that fits."""
     out = np.full(len(edge), -1)
     trace, here = -1, 0
     for fix in range(len(edge)):
@@ -286,19 +286,19 @@ def _covered(
     entered: NDArray[np.bool_],
     left: NDArray[np.bool_],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Stretch of its edge that each traversal covers; all arguments but the fixes have shape (T,)."""
+    """Return the stretch of its edge that each traversal covers; all arguments but the fixes have shape (T,)."""
     low, high = np.full(len(length), np.inf), np.full(len(length), -np.inf)
     np.minimum.at(low, fixes.traversal, fixes.along)
     np.maximum.at(high, fixes.traversal, fixes.along)
     from_start, to_end = np.where(forward, entered, left), np.where(forward, left, entered)
     low, high = np.where(from_start, 0.0, low), np.where(to_end, length, high)
-    # Passed between two fixes, and not through: there is an entry or an exit, but nothing that was covered.
+    # An edge that was entered or left between two fixes, but not both: no stretch of it was covered.
     open_ended = ~np.isfinite(low) | ~np.isfinite(high)
     return np.where(open_ended, 0.0, low), np.where(open_ended, 0.0, high)
 
 
 def robust_sigma(values: NDArray[np.float64], group: NDArray[np.int64], n_groups: int) -> NDArray[np.float64]:
-    """Return the spread (1 sigma, by the median absolute deviation) of the values of each group, NaN below two values.
+    """Return the spread (1 sigma, from the median absolute deviation) of each group; NaN for fewer than two values.
 
     Examples
     --------

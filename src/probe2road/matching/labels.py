@@ -1,4 +1,4 @@
-"""Labels: reference centrelines where enough traces drive them, and masks of these.
+"""Labels: reference centrelines where enough traces drive them.
 
 A segmentation network cannot be asked for roads that its input does not show. The paper therefore keeps a reference
 centreline only where at least N = 4 traces were matched to it.
@@ -39,16 +39,16 @@ class LabelOptions:
 
     min_traces: NotNegative[int] = 4  # distinct traces; the N of the paper
     max_piece: Positive[float] = 100.0  # m; longer edges are first cut into equal pieces of at least half of this
-    min_share: Annotated[float, Above(0), AtMost(1)] = 0.5  # of a piece that a trace has to cover
+    min_share: Annotated[float, Above(0), AtMost(1)] = 0.5  # least share of a piece that a trace must cover
     matcher: Annotated[str, OneOf(*MATCHERS)] = "own"  # which matcher finds the edges of a trace
-    match: MatchOptions = field(default=MatchOptions())  # of our own matcher
+    match: MatchOptions = field(default=MatchOptions())  # options of our own matcher
     osrm: OsrmOptions = field(default=OsrmOptions())
-    osrm_url: str | None = None  # of a server that runs on the graph that osrm_network makes of the cut reference
-    osrm_folder: Path | None = None  # where OSRM's programs are, if not where find_osrm looks
+    osrm_url: str | None = None  # server that runs on the graph that osrm_network makes of the cut reference
+    osrm_folder: Path | None = None  # folder of OSRM's programs; None: where find_osrm looks
 
 
 def label(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions | None = None) -> RoadGraph:
-    """Keep the pieces of a reference that enough traces of a fleet drive.
+    """Keep the pieces of a reference graph that enough traces of a fleet drive.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def label(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions | None = 
     fleet
         Traces in the same CRS.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -104,7 +104,7 @@ def label(reference: RoadGraph, fleet: Fleet, *, options: LabelOptions | None = 
 
 
 def label_pieces(reference: RoadGraph, fleet: Fleet, options: LabelOptions) -> tuple[RoadGraph, pd.DataFrame]:
-    """Cut a reference and list which trace drives which piece.
+    """Cut a reference graph into pieces, and list which trace drives which piece.
 
     Parameters
     ----------
@@ -158,13 +158,13 @@ def cut_reference(reference: RoadGraph, *, max_piece: float = 100.0) -> RoadGrap
 
 
 def _covered_by_own(pieces: RoadGraph, fleet: Fleet, options: LabelOptions) -> pd.DataFrame:
-    """List the stretches that traces cover, by our own matcher: ``trace``, ``edge`` (row), ``low``, ``high`` (m)."""
+    """List the stretches that traces cover, from our matcher: ``trace``, ``edge`` (row), ``low``, ``high`` (m)."""
     driven, _ = frame(pieces, fleet, match(pieces, fleet, options=options.match))
     return pd.DataFrame({"trace": driven.trace, "edge": driven.edge, "low": driven.low, "high": driven.high})
 
 
 def _covered_by_osrm(pieces: RoadGraph, fleet: Fleet, options: LabelOptions) -> pd.DataFrame:
-    """List the stretches that traces cover, by OSRM; columns as for our own."""
+    """List the stretches that traces cover, from OSRM, with the same columns as from our matcher."""
     if not len(pieces.edges):  # OSRM refuses to make a network of nothing
         return pd.DataFrame({name: np.zeros(0, np.int64) for name in ("trace", "edge", "low", "high")})
     network = osrm_network(pieces, options.osrm)
@@ -178,7 +178,7 @@ def _covered_by_osrm(pieces: RoadGraph, fleet: Fleet, options: LabelOptions) -> 
 
 
 def _joined(table: pd.DataFrame) -> pd.DataFrame:
-    """Shorten stretches of one trace on one edge so that none overlaps another; adds ``length``."""
+    """Shorten stretches of one trace on one edge so that they do not overlap, and add their ``length``."""
     table = table.sort_values(["trace", "edge", "low"], kind="stable")
     reached = table.groupby(["trace", "edge"])["high"].cummax()
     before = reached.groupby([table["trace"], table["edge"]]).shift(1).fillna(-np.inf)

@@ -41,10 +41,10 @@ PROFILES = ("auto", "fleet", "sparse", "published")
 @dataclass(frozen=True)
 @checked
 class MatchOptions:
-    """How to match."""
+    """How traces are matched to the edges of a graph."""
 
-    profile: Annotated[str, OneOf(*PROFILES)] = "auto"  # "auto" takes "fleet" or "sparse", trace by trace
-    sparse_interval: Positive[float] = 5.0  # s, median time between fixes from which "auto" takes "sparse"
+    profile: Annotated[str, OneOf(*PROFILES)] = "auto"  # "auto" chooses "fleet" or "sparse" for each trace
+    sparse_interval: Positive[float] = 5.0  # s, median time between fixes from which "auto" chooses "sparse"
     respect_oneway: bool = True  # whether edges that driving_direction calls one-way are closed the other way
     fleet: RouteModel = field(default=FLEET)
     sparse: RouteModel = field(default=SPARSE)
@@ -53,7 +53,7 @@ class MatchOptions:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """What `match` found.
+    """The result of `match`: where every fix is on the graph, and which edges every trace drove.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Matches:
         return f"Matches({', '.join(f'{count} {name}' for name, count in self._figures().items())})"
 
     def _repr_html_(self) -> str:
-        """Show figures in a notebook, and no id."""
+        """Show figures in a notebook, without any ids."""
         return figures_table("Matches", self._figures())
 
     def _figures(self) -> dict[str, int]:
@@ -107,7 +107,7 @@ def match(
     fleet
         Traces; headings, speeds, accuracies and altitudes are used where they are there.
     options
-        The defaults where it is None.
+        None takes the defaults.
     edge_weights
         Positive weight of every edge, indexed by edge: the alphas of the paper's equation 1. All equal where it
         is None. Only ratios at one node matter.
@@ -166,7 +166,7 @@ def match(
 
 
 def _warn_of_nothing(graph: RoadGraph, fleet: Fleet, matches: Matches) -> None:
-    """Warn where no fix is on the graph: as a rule the two are in different places, or in a wrong CRS."""
+    """Warn if no fix is on the graph: usually the two are in different places, or one has a wrong CRS."""
     if len(fleet.traces) == 0 or matches.fixes["edge"].notna().any():
         return
     if graph.edges.empty:
@@ -220,7 +220,7 @@ def turn_counts(matches: Matches, graph: RoadGraph) -> pd.DataFrame:
 
 
 def _profiles(fleet: Fleet, options: MatchOptions) -> NDArray[np.str_]:
-    """Return the profile of every trace."""
+    """Return the name of the matching profile of every trace."""
     if options.profile != "auto":
         return np.full(fleet.n_traces, options.profile)
     interval = sampling_interval(seconds(fleet), fleet.starts)
@@ -228,7 +228,7 @@ def _profiles(fleet: Fleet, options: MatchOptions) -> NDArray[np.str_]:
 
 
 def _with_traces(fleet: Fleet, traces: NDArray[np.int64]) -> Fleet:
-    """Return the fleet with some of its traces, given by ascending number."""
+    """Return the fleet with only some of its traces, given by ascending number."""
     if len(traces) == fleet.n_traces:
         return fleet
     chosen = np.zeros(fleet.n_traces, bool)
@@ -239,7 +239,7 @@ def _with_traces(fleet: Fleet, traces: NDArray[np.int64]) -> Fleet:
 def _match_profile(
     fleet: Fleet, states: States, weight: NDArray[np.float64], name: str, options: MatchOptions
 ) -> Paths:
-    """Match a fleet with one profile."""
+    """Match a fleet with one matching profile."""
     if name == "published":
         return match_published(fleet, states, weight, options.published)
     model = options.sparse if name == "sparse" else options.fleet
@@ -249,7 +249,7 @@ def _match_profile(
 
 
 def _radius(name: str, options: MatchOptions) -> float:
-    """Distance within which a profile looks for edges, m."""
+    """Return the distance within which a matching profile looks for edges, m."""
     if name == "published":
         return options.published.cutoff
     return options.sparse.radius if name == "sparse" else options.fleet.radius

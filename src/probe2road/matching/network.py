@@ -1,4 +1,4 @@
-"""The states of map matching: directed edges, which of them follow which, and an index of their pieces.
+"""The states of map matching: directed edges, their successors, and a spatial index of their pieces.
 
 Legend of array shapes: N nodes, E edges, D = 2 E directed edges, P straight pieces of all edges one after
 another, F pairs of directed edges that follow each other. Directed edge ``2 e`` is edge row ``e`` driven from u
@@ -82,7 +82,7 @@ class States(NamedTuple):
 
 
 class Follow(NamedTuple):
-    """Which directed edges follow directed edge d: ``state[first[d]:first[d + 1]]``, each at a cost (shape (F,))."""
+    """The successors of directed edge d: ``state[first[d]:first[d + 1]]``, each with a cost (shape (F,))."""
 
     first: NDArray[np.int64]
     state: NDArray[np.int64]
@@ -90,7 +90,7 @@ class Follow(NamedTuple):
 
 
 class _EndDirections(NamedTuple):
-    """Unit directions in which directed edges start (first) and end (last), shape (D,) each; 0 without length."""
+    """Unit directions of directed edges at their start (first) and end (last), shape (D,) each; 0 without length."""
 
     first_dx: NDArray[np.float64]
     first_dy: NDArray[np.float64]
@@ -144,7 +144,7 @@ def build_states(graph: RoadGraph, *, respect_oneway: bool = True) -> States:
 
 
 def edge_weight_array(graph: RoadGraph, weights: pd.Series | None) -> NDArray[np.float64]:
-    """Bring weights of edges into the order of the edges; ones where there are none.
+    """Return the weights of edges in the order of the edges; all are 1 if no weights are given.
 
     Raises
     ------
@@ -163,7 +163,7 @@ def edge_weight_array(graph: RoadGraph, weights: pd.Series | None) -> NDArray[np
 
 
 def build_follow(states: States, weight: NDArray[np.float64], *, uturn_cost: float, turn_cost: float) -> Follow:
-    """List the successors of every directed edge with the cost of going on to them.
+    """List the successors of every directed edge, with the cost of continuing on each.
 
     The cost is that of the turn, and the negative log of the weight of the edge entered over the largest weight
     at the node. This is equation 1 of the paper up to the number of edges at the node, which would make a
@@ -186,7 +186,7 @@ def build_follow(states: States, weight: NDArray[np.float64], *, uturn_cost: flo
 
 
 def _end_directions(states: States) -> _EndDirections:
-    """Return the unit directions in which directed edges start and end; 0 without length.
+    """Return the unit directions of directed edges at their start and end; 0 for edges without length.
 
     Those of their first and last piece, however short: the costs of turns are fitted to these, not to `RoadGraph.ends`.
     """
@@ -211,31 +211,31 @@ def _end_directions(states: States) -> _EndDirections:
 def _follow(
     states: States, entry: NDArray[np.float64], directions: _EndDirections, uturn_cost: float, turn_cost: float
 ) -> Follow:
-    """List the successors; ``entry``, shape (D,), is the cost of entering a directed edge, the turn not included."""
+    """List successors; ``entry``, shape (D,), is the cost of entering a directed edge, without the cost of the turn."""
     head, allowed, out_first, out = states.head, states.allowed, states.out_first, states.out
     first_dx, first_dy, last_dx, last_dy = directions
     n_states = len(head)
     first = np.zeros(n_states + 1, np.int64)
-    for d in range(n_states):
+    for directed in range(n_states):
         count = 0
-        if allowed[d]:
-            for k in range(out_first[head[d]], out_first[head[d] + 1]):
+        if allowed[directed]:
+            for k in range(out_first[head[directed]], out_first[head[directed] + 1]):
                 count += allowed[out[k]]
-        first[d + 1] = first[d] + count
+        first[directed + 1] = first[directed] + count
     state, cost = np.empty(first[-1], np.int64), np.empty(first[-1])
-    for d in range(n_states):
-        if not allowed[d]:
+    for directed in range(n_states):
+        if not allowed[directed]:
             continue
-        place = first[d]
-        low, high = out_first[head[d]], out_first[head[d] + 1]
+        place = first[directed]
+        low, high = out_first[head[directed]], out_first[head[directed] + 1]
         for k in range(low, high):
             other = out[k]
             if not allowed[other]:
                 continue
             state[place] = other
-            cosine = last_dx[d] * first_dx[other] + last_dy[d] * first_dy[other]
+            cosine = last_dx[directed] * first_dx[other] + last_dy[directed] * first_dy[other]
             cost[place] = entry[other] + turn_cost * (1.0 - cosine) / 2.0
-            if other == d ^ 1:
+            if other == directed ^ 1:
                 cost[place] += uturn_cost if high - low > 1 else uturn_cost / 2.0
             place += 1
     return Follow(first, state, cost)
@@ -244,7 +244,7 @@ def _follow(
 def _build_grid(
     x: NDArray[np.float64], y: NDArray[np.float64], dx: NDArray[np.float64], dy: NDArray[np.float64]
 ) -> CellIndex:
-    """Lay cells over the pieces, about four for each piece and none smaller than 50 m."""
+    """Cover the pieces with a grid: about four cells for each piece, and no cell smaller than 50 m."""
     if not len(x):
         return CellIndex(0.0, 0.0, _MIN_CELL, 1, 1, np.zeros(2, np.int64), np.zeros(0, np.int32))
     left, bottom = float(np.minimum(x, x + dx).min()), float(np.minimum(y, y + dy).min())
@@ -268,7 +268,7 @@ def _fill_grid(
     columns: int,
     rows: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Enter every piece in the cells that it may touch: row by row, those between its ends within the row.
+    """List every piece in the cells that it may touch: row by row, in the columns between its ends within the row.
 
     Two passes: the first counts, the second fills.
     """

@@ -1,4 +1,4 @@
-"""What the model sees of a fleet: key fixes, times, courses, spreads, and altitudes on the datum of the graph."""
+"""The observations of the matching model: key fixes, times, courses, spreads, and altitudes relative to the graph."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from probe2road.matching.viterbi import Observations
 
 __all__ = ["observe", "sampling_interval", "seconds"]
 
-_CLOCKLESS_SPEED = 15.0  # m/s, to make up times of traces without clock
+_CLOCKLESS_SPEED = 15.0  # m/s, to estimate times of traces without a clock
 _SLOW = 2.0  # m/s, below which a receiver's heading is noise
-_AGREE = 2.0  # m, range of the altitudes of all roads near a fix, below which they tell the bias of the trace
-_BIAS_REACH = 30  # key fixes on either side that the bias at one is the median of
+_AGREE = 2.0  # m, range of the altitudes of all roads near a fix, below which they show the bias of the trace
+_BIAS_REACH = 30  # key fixes on either side, over which the median of the bias is taken
 
 
 def seconds(fleet: Fleet) -> NDArray[np.float64]:
-    """Return the times of the fixes in seconds, made up from the distance driven where a trace has no clock."""
+    """Return the times of the fixes in seconds, estimated from the driven distance for a trace without a clock."""
     time = fleet.traces["t"].to_numpy(dtype="datetime64[ns]")
     known = ~np.isnat(time)
     origin = time[known].min() if known.any() else np.datetime64(0, "ns")
@@ -33,7 +33,7 @@ def seconds(fleet: Fleet) -> NDArray[np.float64]:
 
 
 def sampling_interval(t: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the median time between the fixes of every trace, s; 0 for a trace of one fix.
+    """Return the median time between the fixes of every trace, s; 0 for a trace with only one fix.
 
     Examples
     --------
@@ -45,7 +45,7 @@ def sampling_interval(t: NDArray[np.float64], starts: NDArray[np.int64]) -> NDAr
 
 
 def observe(fleet: Fleet, t: NDArray[np.float64], states: States, model: RouteModel) -> Observations:
-    """Derive the observations of a model from the fixes of a fleet.
+    """Compute the observations of a model from the fixes of a fleet.
 
     The course of a fix is its ``heading`` where the column has one and the vehicle moves, else the direction
     from the key fix before to the key fix after. ``accuracy`` widens the spread and never narrows it below the
@@ -77,7 +77,7 @@ def observe(fleet: Fleet, t: NDArray[np.float64], states: States, model: RouteMo
 def _key_fixes(
     x: NDArray[np.float64], y: NDArray[np.float64], starts: NDArray[np.int64], spacing: float
 ) -> NDArray[np.bool_]:
-    """Mark the first fix of every trace, those at least the spacing from the key fix before, and the last."""
+    """Mark the first and last fix of every trace, and fixes at least the spacing away from the last marked fix."""
     key = np.zeros(len(x), np.bool_)
     for trace in range(len(starts) - 1):
         last = -1
@@ -99,7 +99,7 @@ def _courses(
     key: NDArray[np.bool_],
     model: RouteModel,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Direction from the key fix before to the key fix after, and its weight; shape (fixes,) each.
+    """Return the direction from the key fix before to the key fix after, and its weight; shape (fixes,) each.
 
     A fix without a key fix before, or none soon enough, uses itself. The weight grows with the distance
     covered, because noise turns short chords most.
@@ -131,7 +131,7 @@ def _vertical_bias(
     key: NDArray[np.bool_],
     radius: float,
 ) -> NDArray[np.float64]:
-    """Estimate by how much the altitudes of a trace are too high, shape (fixes,); NaN where nothing tells.
+    """Estimate by how much the altitudes of a trace are too high, shape (fixes,); NaN if it cannot be estimated.
 
     Strategy: vertical errors drift slowly. Where all roads near a fix have about one altitude, the difference to it
     is a sample of the error, whichever road was driven. The error at any fix is the median of the samples around

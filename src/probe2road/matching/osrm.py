@@ -1,4 +1,4 @@
-"""OSRM as a map matcher: a road graph prepared for it, a server on this machine, and requests to any server.
+"""OSRM as a map matcher: a road graph prepared for it, a local server, and requests to any server.
 
 The binaries come with the package ``osrm-bindings``. Its wheels are for Python 3.12 and later, but the binaries in them
 are programs of their own: beside an older Python, unpack a wheel anywhere with ``pip install --no-deps --only-binary
@@ -43,19 +43,19 @@ logger = logging.getLogger(__name__)
 
 _FOLDER = "PROBE2ROAD_OSRM"  # environment variable
 _TOOLS = ("osrm-extract", "osrm-partition", "osrm-customize", "osrm-routed")
-_DECIMALS = 7  # of a degree, in OSM files
+_DECIMALS = 7  # decimals of a degree in OSM files
 _START = 30.0  # s that a server may take to answer
 
 
 @dataclass(frozen=True)
 @checked
 class OsrmOptions:
-    """How OSRM is asked (METHOD 5.2)."""
+    """How traces are matched with OSRM (METHOD 5.2)."""
 
     radius: Positive[float] = 8.0  # m, 1 sigma of fixes; it looks for roads within three times that
     min_confidence: Share = 0.5  # sub-matchings below are dropped
-    spacing: NotNegative[float] = 10.0  # m and
-    interval: NotNegative[float] = 1.0  # s that lie between two fixes that are sent, at least
+    spacing: NotNegative[float] = 10.0  # m, and
+    interval: NotNegative[float] = 1.0  # s, least distances of two fixes that are sent
     chunk: Positive[int] = 200  # fixes in a request
     overlap: NotNegative[int] = 5  # fixes that a request repeats of the one before
     vertex_spacing: Positive[float] = 20.0  # m between vertices of the network, at most: resolution of what was driven
@@ -71,7 +71,7 @@ class OsrmOptions:
 
 @dataclass(frozen=True)
 class OsrmNetwork:
-    """A road graph as OSRM gets it: K segments between V vertices, vertex v being OSM node v + 1."""
+    """A road graph as OSRM gets it: K segments between V vertices; vertex v is OSM node v + 1."""
 
     lonlat: NDArray[np.float64]  # (V, 2) degrees
     vertices: NDArray[np.int64]  # (K, 2) vertices of a segment
@@ -130,7 +130,7 @@ def find_osrm(folder: str | Path | None = None) -> Path:
 
 
 def osrm_network(graph: RoadGraph, options: OsrmOptions | None = None) -> OsrmNetwork:
-    """Lay a road graph out for OSRM, with vertices close enough to tell how much of an edge was driven.
+    """Prepare a road graph for OSRM, with vertices close enough to tell how much of an edge was driven.
 
     Examples
     --------
@@ -169,7 +169,7 @@ def osrm_network(graph: RoadGraph, options: OsrmOptions | None = None) -> OsrmNe
 
 @contextmanager
 def osrm_server(network: OsrmNetwork, *, folder: str | Path | None = None) -> Iterator[str]:
-    """Prepare a network for OSRM and serve it on loopback for as long as the context lasts.
+    """Prepare a network for OSRM, and serve it on this machine until the context ends.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def osrm_segments(
     url
         Address of the server, for example ``http://127.0.0.1:5000``.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -272,7 +272,7 @@ def osrm_segments(
 
 
 def _driven(matching: Mapping[str, Any], network: OsrmNetwork) -> NDArray[np.int64]:
-    """List the segments of a sub-matching."""
+    """List the segments that one part of an OSRM matching drove."""
     parts = []
     for leg in matching["legs"]:
         nodes = np.array(leg["annotation"]["nodes"], np.int64) - 1
@@ -282,7 +282,7 @@ def _driven(matching: Mapping[str, Any], network: OsrmNetwork) -> NDArray[np.int
 
 
 def _ask(url: str, lonlat: NDArray[np.float64], seconds: NDArray[np.float64], options: OsrmOptions) -> dict[str, Any]:
-    """Send one request; an empty answer where OSRM finds no match."""
+    """Send one request to OSRM; return an empty answer if OSRM finds no match."""
     places = ";".join(f"{lon:.7f},{lat:.7f}" for lon, lat in lonlat)
     query = {
         "annotations": "nodes",
@@ -317,7 +317,7 @@ def _thinned(
     spacing: float,
     interval: float,
 ) -> NDArray[np.bool_]:
-    """Choose fixes that are far enough from the one chosen before, in place and time (NaN is far)."""
+    """Keep fixes that are far enough in place and time from the last kept fix (NaN counts as far)."""
     chosen = np.zeros(len(xy), np.bool_)
     for trace in range(len(starts) - 1):
         before = -1
@@ -333,7 +333,7 @@ def _thinned(
 
 
 def _write_network(network: OsrmNetwork, path: Path) -> None:
-    """Write a network as OSM data with positive ids, which is all that OSRM takes; one way for each edge."""
+    """Write a network as OSM data, one way for each edge, with positive ids because OSRM accepts no others."""
     heads = np.flatnonzero(np.diff(network.edge, prepend=-1))
     with osmium.SimpleWriter(str(path)) as writer:
         for number, place in enumerate(network.lonlat.tolist(), start=1):
@@ -347,7 +347,7 @@ def _write_network(network: OsrmNetwork, path: Path) -> None:
 
 
 def _run(home: Path, tool: str, *words: str) -> None:
-    """Run one of OSRM's programs to its end."""
+    """Run one of the programs of OSRM until it ends."""
     done = subprocess.run([str(home / "bin" / tool), *words], capture_output=True, text=True, check=False)
     if done.returncode:
         lines = (done.stdout + done.stderr).strip().splitlines() or ["no message"]
@@ -355,14 +355,14 @@ def _run(home: Path, tool: str, *words: str) -> None:
 
 
 def _free_port() -> int:
-    """Return a port of loopback that nobody listens on."""
+    """Return a free port on this machine."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def _wait_for(server: subprocess.Popen[bytes], port: int, log: Path) -> None:
-    """Wait until a server takes connections."""
+    """Wait until a server accepts connections."""
     deadline = time.monotonic() + _START
     while time.monotonic() < deadline and server.poll() is None:
         with socket.socket() as probe:

@@ -1,4 +1,4 @@
-"""Matches on the map: where on its edge every fix was, and one line for every trip."""
+"""Matches on the map: the position of every fix on its edge, and one line for every trip."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MAP_ID = "osmid"  # of the way that an edge is part of, where the graph is read
 
 
 def matched_points(matches: Matches, graph: RoadGraph) -> gpd.GeoDataFrame:
-    """Return the fixes of `Matches` with the place on the edge as geometry, missing where there is no edge.
+    """Return the fixes of `Matches`, with their position on the edge as geometry; it is missing without an edge.
 
     Edges of a graph from OpenStreetMap are named by ``osmid``, too, the id of their way.
 
@@ -53,14 +53,14 @@ def matched_points(matches: Matches, graph: RoadGraph) -> gpd.GeoDataFrame:
 
 
 def matched_edges(matches: Matches, graph: RoadGraph) -> gpd.GeoDataFrame:
-    """Return the steps of `Matches` with the line of the edge as geometry, in the direction that was driven."""
+    """Return the steps of `Matches`, with the line of the edge in driving direction as geometry."""
     rows = step_rows(graph, matches.steps, where="matched_edges")
     table = _with_map_id(matches.steps, graph, np.ones(len(rows), bool), rows)
     return gpd.GeoDataFrame(table, geometry=_driven_lines(matches, graph), crs=graph.crs)
 
 
 def trip_lines(matches: Matches, graph: RoadGraph) -> gpd.GeoDataFrame:
-    """Return one row for every trace that was matched: the line that it drove along the edges, fix to fix.
+    """Return one row for every matched trace: the line along the edges from its first to its last fix.
 
     A path that breaks, where the trace left the network or jumped, is a line of several parts.
 
@@ -110,7 +110,7 @@ def trip_lines(matches: Matches, graph: RoadGraph) -> gpd.GeoDataFrame:
 
 
 def _with_map_id(table: pd.DataFrame, graph: RoadGraph, on: NDArray[np.bool_], rows: NDArray[np.int64]) -> pd.DataFrame:
-    """Add the id that the map has for an edge, where it has one."""
+    """Add the id of each edge in the original map, if it has one."""
     if _MAP_ID not in graph.edges:
         return table
     ids = pd.Series(None, index=table.index, name=_MAP_ID, dtype=object)
@@ -120,7 +120,7 @@ def _with_map_id(table: pd.DataFrame, graph: RoadGraph, on: NDArray[np.bool_], r
 
 
 def _driven_lines(matches: Matches, graph: RoadGraph) -> NDArray[Any]:
-    """Return the line of every step, in plan and in the direction of the drive."""
+    """Return the line of every step, in plan and in driving direction."""
     rows = step_rows(graph, matches.steps, where="matches")
     lines = shapely.force_2d(graph.edges.geometry.to_numpy()[rows])
     forward = matches.steps["forward"].to_numpy(bool)
@@ -128,7 +128,7 @@ def _driven_lines(matches: Matches, graph: RoadGraph) -> NDArray[Any]:
 
 
 def _cut_at_fixes(matches: Matches, graph: RoadGraph) -> NDArray[Any]:
-    """Cut the first and last line of every part where its first and last fix are."""
+    """Cut the first line of every part at its first fix, and the last line at its last fix."""
     steps, lines = matches.steps.reset_index(drop=True), _driven_lines(matches, graph)
     on = matches.fixes[matches.fixes["edge"].notna()]
     offset = on.drop_duplicates(["trace_id", "t"]).set_index(["trace_id", "t"])["offset"]
@@ -148,7 +148,7 @@ def _cut_at_fixes(matches: Matches, graph: RoadGraph) -> NDArray[Any]:
 
 
 def _joined(lines: NDArray[Any], part: NDArray[np.int64], n_parts: int) -> NDArray[Any]:
-    """Join the lines of each part, without the points that two of them share."""
+    """Join the lines of each part; a point that two lines share appears once."""
     if not n_parts:
         return np.zeros(0, dtype=object)
     coordinates, owner = shapely.get_coordinates(lines, return_index=True)

@@ -62,7 +62,7 @@ def emission_table(model: PublishedModel) -> NDArray[np.float64]:
 
 
 def match_published(fleet: Fleet, states: States, weight: NDArray[np.float64], model: PublishedModel) -> Paths:
-    """Match all traces with the published model; ``weight``, shape (E,), are the w of METHOD 4.4."""
+    """Match all traces with the published model; ``weight``, shape (E,), holds the weights w of METHOD 4.4."""
     x, y = (np.ascontiguousarray(fleet.traces[axis].to_numpy(np.float64)) for axis in "xy")
     n_states = int(states.allowed.sum())
     local = model.reentry == "local"
@@ -85,7 +85,7 @@ def match_published(fleet: Fleet, states: States, weight: NDArray[np.float64], m
 
 
 def _shares(states: States, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the share of every directed edge in the weights of all that leave its start node, shape (D,).
+    """Return each directed edge's share of the weights of all edges that leave its start node, shape (D,).
 
     The reverse of the edge that the vehicle comes from counts too, as published.
     """
@@ -123,7 +123,7 @@ def transition(
 
 @njit(cache=True)
 def _may_turn_back(states: States, d: int) -> bool:
-    """Say whether the node at the end of a directed edge is none in the middle of a chain."""
+    """Tell whether vehicles may turn at the end of a directed edge: not at a node in the middle of a chain."""
     n_out = 0
     for k in range(states.out_first[states.head[d]], states.out_first[states.head[d] + 1]):
         n_out += states.allowed[states.out[k]]
@@ -135,7 +135,7 @@ def _match(
     states: States, log_share: NDArray[np.float64], log_emission: NDArray[np.float64],
     x: NDArray[np.float64], y: NDArray[np.float64], starts: NDArray[np.int64], step: float, numbers: _Numbers,
 ) -> Paths:  # fmt: skip
-    """Match all traces."""
+    """Match all traces, and return their paths."""
     n_fixes = len(x)
     fix_step = np.full(n_fixes, -1, np.int64)
     along, distance = np.full(n_fixes, np.nan), np.full(n_fixes, np.nan)
@@ -186,7 +186,7 @@ def _match(
 def _interpolated(
     x: NDArray[np.float64], y: NDArray[np.float64], start: int, stop: int, step: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Divide the way between fixes into the fewest equal steps of at most ``step`` m.
+    """Divide the stretches between fixes into the fewest equal steps of at most ``step`` m.
 
     Returns the places, and the fix that each one is, -1 for places between fixes.
     """
@@ -260,7 +260,7 @@ def _decide(
 def _near_states(
     states: States, log_emission: NDArray[np.float64], n_points: int, scratch: Scratch, state: NDArray[np.int64]
 ) -> tuple[int, NDArray[np.float64]]:
-    """List the directed edges of points, behind unknown; return how many states there are, and their emissions.
+    """List the directed edges of points after the unknown state; return the number of states, and their emissions.
 
     Points come in the order of their edges, so several points of one edge, of which the nearest counts, are neighbours.
     """
@@ -290,7 +290,7 @@ def _best_before(
     states: States, log_share: NDArray[np.float64], d: int, column: NDArray[np.int64], stamp: NDArray[np.int64],
     before: int, score: NDArray[np.float64], enter: float, numbers: _Numbers,
 ) -> tuple[float, int]:  # fmt: skip
-    """Return the best score of a directed edge before its emission, and the column it comes from.
+    """Return the best score of a directed edge before its emission, and the column of its predecessor.
 
     Ties go to staying, then to the lower directed edge, then to unknown.
     """
@@ -313,7 +313,7 @@ def _best_before(
 
 @njit(cache=True)
 def _normalised(score: NDArray[np.float64], floor: float) -> tuple[NDArray[np.float64], int]:
-    """Divide by the sum of the probabilities and drop those below the floor; return the best state too.
+    """Divide probabilities by their sum and drop those below the floor; return the best state, too.
 
     Where nothing is left the chain restarts from the prior. Ties go to the edge that comes first.
     """

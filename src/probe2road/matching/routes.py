@@ -1,4 +1,4 @@
-"""Shortest routes over directed edges, as far as they can matter.
+"""Shortest routes over directed edges, up to a maximum length.
 
 Strategy
 --------
@@ -23,11 +23,11 @@ __all__ = ["Labels", "RouteQuery", "new_labels", "search"]
 
 
 class Labels(NamedTuple):
-    """Labels of directed edges, shape (D,) each.
+    """Labels of directed edges from the last searches, shape (D,) each.
 
-    ``stamp`` is the search that wrote a label, ``key`` and ``driven`` (m) are what it found at the start of the
-    edge, ``before`` the directed edge it came from (-1: the first), ``wanted`` the search that asks for the edge.
-    ``number`` is that of the last search, shape (1,); who searches counts it up first.
+    ``stamp`` is the number of the search that wrote the label. ``key`` and ``driven`` (m) are the label itself, for the
+    start of the edge. ``before`` is the directed edge before (-1: none), ``wanted`` the number of the search that
+    needs the edge. ``number``, shape (1,), is the number of the last search; the caller of a search increases it first.
     """
 
     stamp: NDArray[np.int64]
@@ -39,7 +39,7 @@ class Labels(NamedTuple):
 
 
 class RouteQuery(NamedTuple):
-    """Where routes begin, and how far they matter.
+    """The start of a route search, and its maximum length.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class RouteQuery(NamedTuple):
 
 @njit(cache=True)
 def new_labels(n_states: int) -> Labels:
-    """Return labels that no search has written."""
+    """Return empty labels, before any search."""
     return Labels(
         np.full(n_states, -1, np.int64),
         np.empty(n_states),
@@ -75,7 +75,7 @@ def new_labels(n_states: int) -> Labels:
 
 @njit(cache=True)
 def search(states: States, follow: Follow, query: RouteQuery, labels: Labels) -> None:
-    """Label the starts of directed edges by the best route from a point on another, in the network given first."""
+    """Label the starts of directed edges with the best route from a point on an edge."""
     if query.rest > query.limit:
         return
     heap = [(0.0, 0) for _ in range(0)]
@@ -96,7 +96,7 @@ def _relax(
     follow: Follow, query: RouteQuery, d: int, label: tuple[int, float, float], labels: Labels,
     heap: list[tuple[float, int]],
 ) -> None:  # fmt: skip
-    """Give the successors of a directed edge the label (before, key, driven) of its end, where that is better."""
+    """Label the successors of a directed edge with the label (before, key, driven) of its end, where this is better."""
     before, key, driven = label
     number = labels.number[0]
     for k in range(follow.first[d], follow.first[d + 1]):

@@ -1,4 +1,4 @@
-"""Matched paths as the tables that `probe2road.matching.match.Matches` promises."""
+"""From matched paths to the tables of `probe2road.matching.match.Matches`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["fix_table", "joined_paths", "step_rows", "step_table", "with_strays"
 
 
 def joined_paths(found: list[tuple[NDArray[np.int64], Paths]], owner: NDArray[np.int64]) -> Paths:
-    """Bring the paths of groups of traces into the order of all traces.
+    """Concatenate the paths of groups of traces, in the order of all traces.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def joined_paths(found: list[tuple[NDArray[np.int64], Paths]], owner: NDArray[np
 
 
 def with_strays(paths: Paths, stray: NDArray[np.bool_]) -> Paths:
-    """Put the fixes that were not looked at back into paths: they lie on no step, shape (fixes,)."""
+    """Insert the fixes that were not matched into paths again: they lie on no step, shape (fixes,)."""
     if not stray.any():
         return paths
 
@@ -86,7 +86,7 @@ def fix_table(
     radius: NDArray[np.float64],
     stray: NDArray[np.bool_],
 ) -> pd.DataFrame:
-    """Write one row for each fix.
+    """Return the table of fixes: one row for each fix.
 
     ``radius`` (m), shape (traces,), is what its trace was searched within; ``stray``, shape (fixes,), are those that
     were not looked at.
@@ -113,7 +113,7 @@ def fix_table(
 def _reasons(
     fleet: Fleet, states: States, paths: Paths, radius: NDArray[np.float64], stray: NDArray[np.bool_]
 ) -> pd.Categorical:
-    """Say of every fix without an edge why, missing for the others."""
+    """Return the reason why a fix has no edge, for every fix; it is missing for fixes with an edge."""
     names = [f"no edge within {value:g} m" for value in np.unique(radius)]
     fits_none, no_edges = len(names), len(names) + 1
     code = np.searchsorted(np.unique(radius), radius)[fleet.owner]
@@ -127,7 +127,7 @@ def _reasons(
 
 
 def step_table(graph: RoadGraph, fleet: Fleet, states: States, paths: Paths) -> pd.DataFrame:
-    """Write one row for each traversal of an edge."""
+    """Return the table of steps: one row for each traversal of an edge."""
     n_steps = len(paths.state)
     node_id = graph.nodes.index.to_numpy(np.int64)
     via = np.where(paths.entered, node_id[states.tail[paths.state]], 0) if n_steps else np.zeros(0, np.int64)
@@ -185,7 +185,7 @@ def step_rows(graph: RoadGraph, steps: pd.DataFrame, *, where: str) -> NDArray[n
 
 
 def _first_and_last_fix(paths: Paths) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the first and last fix on every step, -1 where there is none; shape (S,) each."""
+    """Return the rows of the first and last fix on every step, -1 where there is none; shape (S,) each."""
     first, last = np.full(len(paths.state), -1, np.int64), np.full(len(paths.state), -1, np.int64)
     rows = np.flatnonzero(paths.step >= 0)
     last[paths.step[rows]] = rows
@@ -194,6 +194,6 @@ def _first_and_last_fix(paths: Paths) -> tuple[NDArray[np.int64], NDArray[np.int
 
 
 def _times_at(times: pd.Series, rows: NDArray[np.int64]) -> pd.Series:
-    """Return the times of fixes, NaT for row -1."""
+    """Return the times of fixes, given by row; NaT for row -1."""
     taken = times.take(np.maximum(rows, 0)).reset_index(drop=True)
     return taken.mask(rows < 0)

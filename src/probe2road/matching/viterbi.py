@@ -43,14 +43,14 @@ __all__ = [
     "shortest",
 ]
 
-NULL = -1  # came from, or is, no road
-JUMP = -2  # came from the best candidate before, without a route
+NULL = -1  # no road, or reached from no road
+JUMP = -2  # reached from the best candidate before, without a route
 
 _BACKTRACK = 25.0  # m that noise may move a fix back along its edge
 
 
 class Parameters(NamedTuple):
-    """The numbers of a `RouteModel` that the kernels need; see there."""
+    """The numbers of a `RouteModel` that the compiled functions need; the fields are explained there."""
 
     tail: float
     radius: float
@@ -64,7 +64,7 @@ class Parameters(NamedTuple):
 
 
 class Observations(NamedTuple):
-    """What is known at every fix, shape (fixes,) each.
+    """The observations at every fix, shape (fixes,) each.
 
     ``t`` in s; ``sigma`` in m; ``course_x``, ``course_y`` the unit direction of driving and ``kappa`` its weight, 0
     where unknown; ``z`` in m on the datum of the graph, NaN where unknown; ``key`` marks the key fixes.
@@ -82,7 +82,7 @@ class Observations(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What is given: a network, the fixes of all traces, and the numbers of the model."""
+    """The input of the search: a network, the fixes of all traces, and the numbers of the model."""
 
     states: States
     follow: Follow
@@ -107,28 +107,28 @@ class Candidates(NamedTuple):
 
 
 class _Scores(NamedTuple):
-    """Of every candidate: the cost of the best chain that ends there, and the candidate before, `JUMP` or `NULL`."""
+    """For every candidate, the cost of the best chain that ends there, and the candidate before, `JUMP` or `NULL`."""
 
     score: NDArray[np.float64]
     back: NDArray[np.int64]
 
 
 class _Gap(NamedTuple):
-    """From one key fix to the next: the straight line (m), and how many metres a cost of one is worth."""
+    """The gap between two key fixes: its straight length (m), and the number of metres that add a cost of one."""
 
     straight: float
     beta: float
 
 
 class Decision(NamedTuple):
-    """For every key fix of one trace: its candidate or `NULL`, and whether a route leads to it from the key before."""
+    """For every key fix of a trace, its candidate or `NULL`, and whether a route leads to it from the key before."""
 
     chosen: NDArray[np.int64]
     linked: NDArray[np.bool_]
 
 
 def parameters(model: RouteModel) -> Parameters:
-    """Reduce a model to the numbers of the kernels; the cost of no road is that of a fix at ``null_distance``."""
+    """Return the numbers of a model; the cost of no road equals that of a fix at ``null_distance``."""
     null_cost = 0.5 * (model.tail + 1.0) * np.log1p((model.null_distance / model.sigma) ** 2 / model.tail)
     return Parameters(
         tail=float(model.tail),
@@ -145,7 +145,7 @@ def parameters(model: RouteModel) -> Parameters:
 
 @njit(cache=True)
 def find_candidates(problem: Problem, keys: NDArray[np.int64], scratch: Scratch) -> Candidates:
-    """Find the candidates of key fixes, given as rows of the observations, and the costs of their emissions."""
+    """Find the candidates of key fixes, given as rows of the observations, and their emission costs."""
     states, _, observed, parameters = problem
     n_keys = len(keys)
     first = np.zeros(n_keys + 1, np.int64)
@@ -178,7 +178,7 @@ def find_candidates(problem: Problem, keys: NDArray[np.int64], scratch: Scratch)
 
 @njit(cache=True)
 def _emission(problem: Problem, i: int, p: int, along: float, distance: float, reverse: int) -> float:
-    """Return the cost of seeing a fix from a point: of its distance, its course and its altitude."""
+    """Return the emission cost of a candidate for a fix: from its distance, course and altitude."""
     states, _, observed, parameters = problem
     ratio = distance / observed.sigma[i]
     cost = 0.5 * (parameters.tail + 1.0) * np.log1p(ratio * ratio / parameters.tail)
@@ -208,18 +208,18 @@ def decide(problem: Problem, candidates: Candidates, labels: Labels) -> Decision
         jump = score[before] + parameters.break_cost if before >= 0 else np.inf
         enter = null_score + (parameters.break_cost / 2.0 if k > 0 else 0.0)
         floor = min(jump, enter)
-        for c in range(low, high):
-            score[c] = floor
-            back[c] = JUMP if jump < enter else NULL
+        for candidate in range(low, high):
+            score[candidate] = floor
+            back[candidate] = JUMP if jump < enter else NULL
         if k > 0:
             _advance(problem, candidates, k, floor, scores, labels)
         leave = score[before] + parameters.break_cost / 2.0 if before >= 0 else np.inf
         null_back[k] = before if leave <= null_score else NULL
         null_score = min(null_score, leave) + parameters.null_cost
-        for c in range(low, high):
-            score[c] += candidates.cost[c]
-            if best[k] < 0 or score[c] < score[best[k]]:
-                best[k] = c
+        for candidate in range(low, high):
+            score[candidate] += candidates.cost[candidate]
+            if best[k] < 0 or score[candidate] < score[best[k]]:
+                best[k] = candidate
     chosen, linked = np.full(n_keys, NULL, np.int64), np.zeros(n_keys, np.bool_)
     here = best[n_keys - 1]
     if here >= 0 and score[here] > null_score:
@@ -236,7 +236,7 @@ def decide(problem: Problem, candidates: Candidates, labels: Labels) -> Decision
 
 @njit(cache=True)
 def _advance(problem: Problem, candidates: Candidates, k: int, floor: float, scores: _Scores, labels: Labels) -> None:
-    """Improve the scores of the candidates of key k over routes from those of the key before.
+    """Improve the scores of the candidates of key k by routes from the candidates of the key before.
 
     Sources are taken from the best on. A target is of no use any more where its score, its emission included,
     exceeds that of the best target by a jump: from the next key on, the jump is at least as good. ``cap`` is the
@@ -261,35 +261,35 @@ def _advance(problem: Problem, candidates: Candidates, k: int, floor: float, sco
         rest = states.length[origin >> 1] - candidates.progress[source]
         limit, n_wanted, kept = 0.0, 0, 0
         for place in range(n_targets):
-            c = targets[place]
-            cap = min(score[c], lowest + parameters.break_cost - candidates.cost[c])
+            target = targets[place]
+            cap = min(score[target], lowest + parameters.break_cost - candidates.cost[target])
             if cap <= base:
-                continue  # for good, because bases rise and caps fall
-            targets[kept] = c
+                continue  # also for later sources, because bases rise and caps fall
+            targets[kept] = target
             kept += 1
-            if candidates.state[c] == origin:
-                cap = min(cap, base + _stay(candidates, source, c, gap))
+            if candidates.state[target] == origin:
+                cap = min(cap, base + _stay(candidates, source, target, gap))
             reach = straight + beta * (cap - base)
-            if rest + candidates.progress[c] <= reach:  # else no route over the end of the edge is short enough
-                limit = max(limit, reach - candidates.progress[c])
-                n_wanted += labels.wanted[candidates.state[c]] != number
-                labels.wanted[candidates.state[c]] = number
+            if rest + candidates.progress[target] <= reach:  # else no route over the end of the edge is short enough
+                limit = max(limit, reach - candidates.progress[target])
+                n_wanted += labels.wanted[candidates.state[target]] != number
+                labels.wanted[candidates.state[target]] = number
         n_targets = kept
         if n_targets == 0:
             break
         if n_wanted > 0:
             search(states, follow, RouteQuery(origin, rest, beta, limit, n_wanted), labels)
         for place in range(n_targets):
-            c = targets[place]
-            cost = base + _route(candidates, source, c, gap, labels)[0]
-            if cost < score[c]:
-                score[c], back[c] = cost, source
-                lowest = min(lowest, cost + candidates.cost[c])
+            target = targets[place]
+            cost = base + _route(candidates, source, target, gap, labels)[0]
+            if cost < score[target]:
+                score[target], back[target] = cost, source
+                lowest = min(lowest, cost + candidates.cost[target])
 
 
 @njit(cache=True)
 def _gap_before(problem: Problem, candidates: Candidates, k: int) -> _Gap:
-    """Measure from the key fix before to key k."""
+    """Measure the gap from the key fix before to key k."""
     observed, parameters = problem.observed, problem.parameters
     i, j = candidates.fix[k - 1], candidates.fix[k]
     straight = np.hypot(observed.x[j] - observed.x[i], observed.y[j] - observed.y[i])
@@ -312,14 +312,14 @@ def _route(candidates: Candidates, source: int, target: int, gap: _Gap, labels: 
 
 @njit(cache=True, inline="always")
 def _stay(candidates: Candidates, source: int, target: int, gap: _Gap) -> float:
-    """Return the cost of going between two candidates on one directed edge; noise may go back a little."""
+    """Return the cost of going between two candidates on one directed edge; noise may lead a little backwards."""
     step = candidates.progress[target] - candidates.progress[source]
     return abs(step - gap.straight) / gap.beta if step >= -_BACKTRACK else np.inf
 
 
 @njit(cache=True)
 def shortest(problem: Problem, candidates: Candidates, k: int, source: int, target: int, labels: Labels) -> bool:
-    """Search the route that `decide` found between candidates of key k - 1 and k anew, for its labels.
+    """Repeat the search for the route that `decide` found between candidates of keys k - 1 and k, to label its edges.
 
     Returns whether the route stays on one edge and needs no labels.
     """

@@ -1,4 +1,4 @@
-"""APLS: are the routes as long as in the reference? Average path length similarity.
+"""APLS, the average path length similarity: are the routes as long as in the reference? Both ways, by control points.
 
 Strategy. Control points of one graph are snapped onto the other. Both graphs are cut at those points, so that one
 Dijkstra run from each point on either graph gives the lengths of all routes, and the two square matrices of lengths
@@ -31,13 +31,13 @@ class AplsOptions:
 
     snap: Positive[float] = 4.0  # m from a control point to the other graph; 6 to 8 suits highways at 1 m accuracy
     spacing: Positive[float] = 50.0  # m between control points along an edge
-    max_points: Positive[int] = 1000  # control points that are drawn at random where there are more
+    max_points: Positive[int] = 1000  # most control points; of more, these are chosen at random
     min_length: NotNegative[float] = 0.001  # m; shorter routes are not compared
-    seed: NotNegative[int] = 0  # of the draw
+    seed: NotNegative[int] = 0  # of the random choice
 
 
 def apls(proposal: RoadGraph, reference: RoadGraph, *, options: AplsOptions | None = None) -> Score:
-    """Score the lengths of routes.
+    """Score a proposal by the lengths of its routes, compared with those of the reference.
 
     Both graphs are normalised first, as for `geo`. An empty graph scores 0, and so does one without any route.
 
@@ -79,7 +79,7 @@ def apls(proposal: RoadGraph, reference: RoadGraph, *, options: AplsOptions | No
 
 
 def apls_networks(proposal: Network, reference: Network, options: AplsOptions) -> Score:
-    """Score normalised networks, as `apls`."""
+    """Score normalised networks in the same way as `apls`."""
     proposed_similar, proposed = _similarity(proposal, reference, options)
     wanted_similar, wanted = _similarity(reference, proposal, options)
     return Score.from_counts(
@@ -110,7 +110,7 @@ def _similarity(network: Network, other: Network, options: AplsOptions) -> tuple
 
 
 def _control_points(network: Network, options: AplsOptions) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Place control points at all nodes with edges and along all edges; draw some where there are too many."""
+    """Place control points at all nodes with edges and along all edges; of too many, choose some at random."""
     nodes = np.flatnonzero(network.degree > 0)
     at_node = network.incident_edge[network.incident_first[nodes]]
     start = np.where(network.u[at_node] == nodes, 0.0, network.length[at_node])
@@ -126,7 +126,7 @@ def _control_points(network: Network, options: AplsOptions) -> tuple[NDArray[np.
 
 
 def _snap(xy: NDArray[np.float64], other: Network, radius: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Find the closest position on another network, the lowest edge on ties; edge -1 where none is near."""
+    """Find the closest position on another network, on the lowest edge for ties; edge -1 if no edge is near."""
     edge, offset = np.full(len(xy), -1, np.int64), np.zeros(len(xy))
     if len(other.lines) == 0:
         return edge, offset
@@ -140,7 +140,7 @@ def _snap(xy: NDArray[np.float64], other: Network, radius: float) -> tuple[NDArr
 
 
 def _route_lengths(network: Network, edge: NDArray[np.int64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the lengths of the shortest routes between positions, shape (S, S); infinity where there is none.
+    """Return the lengths of the shortest routes between positions, shape (S, S); infinity if there is no route.
 
     Every edge becomes a chain through its positions; positions are numbered behind the nodes.
     """

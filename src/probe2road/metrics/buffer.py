@@ -1,4 +1,4 @@
-"""Buffer GEO: which share of either map lies near the other? Free of matching, and so of duplicates."""
+"""Buffer GEO: which share of each graph lies near the other? It needs no matching, and so ignores duplicate roads."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class BufferGeoOptions:
 
 
 def buffer_geo(proposal: RoadGraph, reference: RoadGraph, *, options: BufferGeoOptions | None = None) -> list[Score]:
-    """Score which share of each map's length lies within a distance of the other map.
+    """Score which share of each graph's length lies within a distance of the other graph.
 
     A segment that is drawn twice, in either direction, counts once; roads drawn twice side by side count twice and
     cost nothing, so read the lengths in the details beside the score. An empty graph scores 0.
@@ -68,7 +68,7 @@ def buffer_geo(proposal: RoadGraph, reference: RoadGraph, *, options: BufferGeoO
 
 
 def buffer_geo_networks(proposal: Network, reference: Network, options: BufferGeoOptions) -> list[Score]:
-    """Score normalised networks, as `buffer_geo`."""
+    """Score normalised networks in the same way as `buffer_geo`."""
     segments = [_distinct_segments(network) for network in (proposal, reference)]
     lengths = [np.hypot(*(part[:, 1] - part[:, 0]).T) for part in segments]
     totals = [float(length.sum()) for length in lengths]
@@ -80,7 +80,7 @@ def buffer_geo_networks(proposal: Network, reference: Network, options: BufferGe
     scores = []
     for radius in options.radii:
         near = [
-            min(float(weight[gap <= radius].sum()), total)  # the parts of a whole can add up to a rounding more
+            min(float(weight[gap <= radius].sum()), total)  # by rounding, the sum of parts can exceed the total
             for gap, weight, total in zip(gaps, weights, totals, strict=True)
         ]
         score = Score.from_counts(
@@ -97,7 +97,7 @@ def buffer_geo_networks(proposal: Network, reference: Network, options: BufferGe
 
 
 def _distinct_segments(network: Network) -> NDArray[np.float64]:
-    """Return the straight pieces of all edges, each once whatever its direction, shape (n, 2 ends, 2)."""
+    """Return the straight segments of all edges without duplicates in either direction, shape (n, 2 ends, 2)."""
     pieces = np.stack([network.xy[:-1], network.xy[1:]], axis=1) if len(network.xy) else np.empty((0, 2, 2))
     inner = np.ones(len(pieces), bool)
     inner[network.first[1:-1] - 1] = False  # from the end of an edge to the start of the next
@@ -112,7 +112,7 @@ def _distinct_segments(network: Network) -> NDArray[np.float64]:
 def _middles(
     segments: NDArray[np.float64], length: NDArray[np.float64], spacing: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Cut segments into equal parts; return the parts' middles, shape (S, 2), and lengths, shape (S,)."""
+    """Cut segments into equal parts; return the midpoints of the parts, shape (S, 2), and their lengths, shape (S,)."""
     count = np.ceil(length / spacing).astype(np.int64)
     owner = np.repeat(np.arange(len(count)), count)
     rank = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)

@@ -1,4 +1,4 @@
-"""The one entry: any number of metrics of one proposal against one reference."""
+"""Evaluation: any number of metrics of one proposal against one reference."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def evaluate(
     area: Any = None,
     merge: bool = True,
 ) -> pd.DataFrame:
-    """Score a proposal against a reference.
+    """Score a proposed road graph against a reference graph.
 
     Parameters
     ----------

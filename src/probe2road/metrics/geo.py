@@ -54,7 +54,7 @@ HE_BALAKRISHNAN_2022 = GeoOptions(spacing=0.25, radius=1.0, matching="global", m
 
 
 def geo(proposal: RoadGraph, reference: RoadGraph, *, options: GeoOptions | None = None) -> Score:
-    """Score where the proposal's roads lie.
+    """Score whether the proposal's roads lie where the reference has roads.
 
     Both graphs are normalised first: the proposal goes to the reference's CRS, nodes of degree 2 are merged.
     An empty graph scores 0.
@@ -94,7 +94,7 @@ def geo(proposal: RoadGraph, reference: RoadGraph, *, options: GeoOptions | None
 
 
 def geo_networks(proposal: Network, reference: Network, options: GeoOptions) -> Score:
-    """Score normalised networks, as `geo`."""
+    """Score normalised networks in the same way as `geo`."""
     targets = sample_edges(reference, options.spacing)
     matched = proposed = 0
     for phase in range(options.phases):
@@ -114,7 +114,7 @@ def geo_networks(proposal: Network, reference: Network, options: GeoOptions) -> 
 
 
 def geo_samples(proposal: Network, reference: Network, options: GeoOptions) -> GeoSamples:
-    """Return where each sample of normalised networks lies and whether it matched, for maps and resampling.
+    """Return the positions of the samples of normalised networks, and which matched, for maps and resampling.
 
     Only the first sampling origin is taken, whatever ``options.phases``: with one phase the sums over the samples
     are the counts of `geo_networks`. An empty network has no samples.
@@ -131,7 +131,7 @@ def geo_samples(proposal: Network, reference: Network, options: GeoOptions) -> G
 
 
 def _match_samples(samples: Samples, targets: Samples, options: GeoOptions) -> GeoSamples:
-    """Match the samples of one sampling origin."""
+    """Match the samples for one sampling origin."""
     pairs = candidate_pairs(
         samples.xy,
         targets.xy,

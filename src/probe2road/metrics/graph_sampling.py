@@ -1,4 +1,4 @@
-"""Graph sampling: one exploration of each whole component, matched one to one with a bearing test."""
+"""Graph sampling: one exploration of each whole component, with samples matched one to one and by bearing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class GraphSamplingOptions:
 def graph_sampling(
     proposal: RoadGraph, reference: RoadGraph, *, options: GraphSamplingOptions | None = None
 ) -> list[Score]:
-    """Score both maps' samples at several distances.
+    """Score the matched samples of both graphs at several distances.
 
     From the lowest node of every connected component samples are laid every ``spacing`` metres of network
     distance through the whole component. An empty graph scores 0.
@@ -72,7 +72,7 @@ def graph_sampling(
 
 
 def graph_sampling_networks(proposal: Network, reference: Network, options: GraphSamplingOptions) -> list[Score]:
-    """Score normalised networks, as `graph_sampling`."""
+    """Score normalised networks in the same way as `graph_sampling`."""
     samples, targets = _explore(proposal, options), _explore(reference, options)
     scores = []
     for radius in options.radii:

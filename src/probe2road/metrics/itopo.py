@@ -39,21 +39,21 @@ class ItopoOptions:
     reach: Positive[float] = 30.0  # m of network distance around a centre
     average: Literal["micro", "macro"] = "micro"  # sums over all pairs, or means of their ratios
     strict: bool = False  # precision from the proposal's nodes only, recall from the reference's only
-    tie: NotNegative[float] = 0.1  # m; edges that much farther than the closest tie with it, and the direction decides
+    tie: NotNegative[float] = 0.1  # m; edges this much farther than the closest tie with it, and the direction decides
     branch: Positive[float] = 10.0  # m over which the direction of a branch is measured
-    centre: Literal["projection", "node"] = "projection"  # or the other graph's nearest node, where one is in radius
+    centre: Literal["projection", "node"] = "projection"  # or the other graph's nearest node, if one is within radius
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Counts of the pairs around the nodes of one graph, shape (K,) each.
+    """Counts of samples around the nodes of one graph, for K pairs of a node and its projection, shape (K,) each.
 
     Attributes
     ----------
     node
         Row of the node in its network.
     matched, proposal, reference
-        Samples matched, and samples in the surroundings on either side.
+        Number of matched samples, and of all samples around the node in each graph.
     """
 
     node: NDArray[np.int64]
@@ -63,7 +63,7 @@ class Pairs:
 
 
 def itopo(proposal: RoadGraph, reference: RoadGraph, *, options: ItopoOptions | None = None) -> Score:
-    """Score how the proposal's roads connect.
+    """Score whether the proposal's roads connect as those of the reference do.
 
     Both graphs are normalised first, as for `geo`. A node without an edge of the other graph within the radius
     pairs with nothing: all its samples count as wrong (proposal) or missing (reference). An empty graph scores 0.
@@ -109,7 +109,7 @@ def itopo(proposal: RoadGraph, reference: RoadGraph, *, options: ItopoOptions | 
 
 
 def itopo_networks(proposal: Network, reference: Network, options: ItopoOptions) -> Score:
-    """Score normalised networks, as `itopo`."""
+    """Score normalised networks in the same way as `itopo`."""
     around_proposal, around_reference = itopo_pairs(proposal, reference, options=options)
     precision_pairs = [around_proposal] if options.strict else [around_proposal, around_reference]
     recall_pairs = [around_reference] if options.strict else [around_proposal, around_reference]
@@ -140,7 +140,7 @@ def itopo_networks(proposal: Network, reference: Network, options: ItopoOptions)
 
 
 def itopo_pairs(proposal: Network, reference: Network, options: ItopoOptions) -> tuple[Pairs, Pairs]:
-    """Return the counts of every pair: around the proposal's nodes, and around the reference's."""
+    """Return the sample counts of every pair: around the proposal's nodes, and around the reference's nodes."""
     sides = []
     for network, other in ((proposal, reference), (reference, proposal)):
         nodes = np.flatnonzero((network.degree == 1) | (network.degree > 2))
@@ -177,7 +177,7 @@ def project_nodes(
     points = shapely.points(network.node_xy[nodes])
     row, candidate = shapely.STRtree(other.lines).query(points, predicate="dwithin", distance=options.radius + EPSILON)
     along = shapely.line_locate_point(other.lines[candidate], points[row])
-    # A line that comes back to its own end is found where it passes there first; the end is meant.
+    # A line that returns to its own end would be located where it passes there first; the end is meant.
     last = shapely.distance(shapely.get_point(other.lines[candidate], -1), points[row])
     along = np.where(
         last <= shapely.distance(other.lines[candidate], points[row]) + EPSILON, other.length[candidate], along
@@ -190,7 +190,7 @@ def project_nodes(
     row, candidate, along, direction = row[tied], candidate[tied], along[tied], direction[tied]
     angle = _angle_to_branches(network, nodes[row], direction, options.branch)
     passes = np.minimum(along, other.length[candidate] - along) > EPSILON
-    # Cosines near 1 give angles to no more than some 1e-6 degrees.
+    # Angles from cosines near 1 are only accurate to about 1e-6 degrees.
     order = np.lexsort((candidate, passes, np.round(angle, 4), row))
     kept = order[np.unique(row[order], return_index=True)[1]]
     edge[row[kept]], offset[row[kept]] = candidate[kept], along[kept]
@@ -204,7 +204,7 @@ def _snap_to_nodes(
     offset: NDArray[np.float64],
     radius: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Move positions to the nearest junction or dead end of the other network within the radius, where there is one."""
+    """Move positions to the nearest junction or dead end of the other network, if one is within the radius."""
     nodes = np.flatnonzero((other.degree == 1) | (other.degree > 2))
     if len(nodes) == 0:
         return edge, offset
@@ -219,7 +219,7 @@ def _snap_to_nodes(
 def _angle_to_branches(
     network: Network, nodes: NDArray[np.int64], direction: NDArray[np.float64], reach: float
 ) -> NDArray[np.float64]:
-    """Return the smallest angle, degrees, between a line through each node and the node's branches, shape (K,)."""
+    """Return the smallest angle between a line through each node and the node's branches, degrees, shape (K,)."""
     count = network.degree[nodes]
     owner = np.repeat(np.arange(len(nodes)), count)
     place = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
@@ -241,7 +241,7 @@ def _counts(samples: Samples) -> NDArray[np.int64]:
 
 
 def _mean_ratio(matched: NDArray[np.int64], total: NDArray[np.int64]) -> float:
-    """Mean of the ratios that are defined; 0 where none is."""
+    """Return the mean of the ratios that are defined; 0 if none is."""
     there = total > 0
     return ratio((matched[there] / total[there]).sum(), there.sum())
 
@@ -254,7 +254,7 @@ def _match_pairs(
     b_xy: NDArray[np.float64],
     radius: float,
 ) -> NDArray[np.int64]:
-    """Count the greedy one-to-one matches of every pair: each ``a`` in order takes its nearest free ``b``."""
+    """Count the greedy one-to-one matches of every pair: each ``a``, in order, takes the nearest ``b`` that is free."""
     matched = np.zeros(len(a_first) - 1, np.int64)
     used = np.zeros(len(b_xy), np.bool_)
     for pair in range(len(matched)):

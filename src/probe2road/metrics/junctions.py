@@ -1,10 +1,10 @@
-"""Junction connectivity: do roads that meet, or cross, in the reference connect alike? Pairs of arms, one by one.
+"""Junction connectivity: do roads that meet or cross in the reference connect alike? Measured by pairs of arms.
 
 Strategy. The reference is cut at its junctions and wherever two of its edges cross in plan, which is where a mask
-shows a junction, real or not. Each piece between two such places is an arm of both. All pairs of arms of a place are
-asked the same question on either graph: is there a short way between a spot on the one and a spot on the other? On
-the reference the spots are known; on the proposal they are on the nearest edges of about their directions. A way is
-a distance between nodes, from Dijkstra's algorithm with a limit, and what is left to the spots on their edges.
+shows a junction, real or not. Each piece between two such places is an arm of both. For each pair of arms of a place,
+the question is the same in both graphs: is there a short route from a position on one arm to a position on the other?
+In the reference the positions are known; in the proposal they are on the nearest edges with about their directions.
+The length of a route is a distance between nodes, from Dijkstra's algorithm with a limit, and the rest on the edges.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from probe2road.options import checked
 
 __all__ = ["JunctionOptions", "JunctionPairs", "junction_pairs", "junctions", "junctions_networks"]
 
-_BATCH = 512  # nodes that distances are computed from at a time; bounds memory
+_BATCH = 512  # nodes from which distances are computed at a time; limits memory
 
 
 @dataclass(frozen=True)
@@ -35,17 +35,17 @@ class JunctionOptions:
     """Parameters of junction connectivity; the defaults are those of the refinement's junction suite."""
 
     arm: Positive[float] = 35.0  # m from a place at which its arms are looked up, at most half the arm
-    radius: Positive[float] = 10.0  # m from there to an edge of the proposal, inclusive
+    radius: Positive[float] = 10.0  # m from that position to an edge of the proposal, inclusive
     max_angle: Positive[float] = 30.0  # degrees between the two, as undirected lines
-    span: Positive[float] = 2.0  # m to either side over which the direction of a road is taken
-    detour: Positive[float] = 1.5  # a way connects two arms up to so many times the distance by way of their place ...
-    slack: Positive[float] = 20.0  # m more
-    same_node: Positive[float] = 4.0  # m; edges that cross so close to a node they share do not cross
+    span: Positive[float] = 2.0  # m to either side, over which the direction of a road is measured
+    detour: Positive[float] = 1.5  # a route connects two arms up to this factor times the distance over their place ...
+    slack: Positive[float] = 20.0  # m, plus this length
+    same_node: Positive[float] = 4.0  # m; crossings this close to a common node do not count
 
 
 @dataclass(frozen=True)
 class JunctionPairs:
-    """Pairs of arms at the junctions and crossings of a reference; K pairs.
+    """K pairs of arms at the junctions and crossings of a reference.
 
     Attributes
     ----------
@@ -70,16 +70,16 @@ class JunctionPairs:
 
 @dataclass(frozen=True)
 class _Arms:
-    """Arms, sorted by the place they belong to; shape (A,) each. Places are nodes, then crossings."""
+    """Arms, sorted by their places; shape (A,) each. Places are nodes, followed by crossings."""
 
     place: NDArray[np.int64]
     edge: NDArray[np.int64]
-    offset: NDArray[np.float64]  # m along the edge, of the spot where the arm is looked up
-    reach: NDArray[np.float64]  # m from the place to that spot
+    offset: NDArray[np.float64]  # m along the edge, position at which the arm is looked up
+    reach: NDArray[np.float64]  # m from the place to that position
 
 
 def junctions(proposal: RoadGraph, reference: RoadGraph, *, options: JunctionOptions | None = None) -> Score:
-    """Score whether arms connect where roads of the reference meet or cross.
+    """Score whether arms are connected as in the reference, wherever its roads meet or cross.
 
     Both graphs are normalised first, as for `geo`. Places are the nodes of the reference with three edges or more,
     and the points where two of its edges cross in plan without a node, as at a bridge. Every pair of arms of a place
@@ -129,7 +129,7 @@ def junctions(proposal: RoadGraph, reference: RoadGraph, *, options: JunctionOpt
 
 
 def junctions_networks(proposal: Network, reference: Network, options: JunctionOptions) -> Score:
-    """Score normalised networks, as `junctions`."""
+    """Score normalised networks in the same way as `junctions`."""
     pairs = junction_pairs(proposal, reference, options=options)
     both = int(np.count_nonzero(pairs.true & pairs.said))
     return Score.from_counts(
@@ -151,7 +151,7 @@ def junctions_networks(proposal: Network, reference: Network, options: JunctionO
 
 
 def junction_pairs(proposal: Network, reference: Network, options: JunctionOptions) -> JunctionPairs:
-    """Return what either network says about every pair of arms of the reference, for maps and resampling."""
+    """Return for every pair of arms of the reference whether each network connects it, for maps and resampling."""
     i, j, crossing_xy = _crossings(reference, options.same_node)
     arms = _arms(reference, i, j, crossing_xy, options.arm)
     one, other = _pairs(arms.place)
@@ -173,7 +173,7 @@ def junction_pairs(proposal: Network, reference: Network, options: JunctionOptio
 
 
 def _crossings(network: Network, same_node: float) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Find where two edges cross in plan without a common node: their rows and the points, shape (X, 2)."""
+    """Find where two edges without a common node cross in plan: their rows and the points, shape (X, 2)."""
     lines = network.lines
     i, j = shapely.STRtree(lines).query(lines, predicate="intersects")
     i, j = i[i < j], j[i < j]
@@ -213,7 +213,7 @@ def _arms(network: Network, i: NDArray[np.int64], j: NDArray[np.int64], xy: NDAr
 
 
 def _pairs(place: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """List the pairs of rows of the same place, the lower row first; places ascend."""
+    """List the pairs of rows of the same place, the lower row first, in the order of the places."""
     row = np.arange(len(place))
     later = np.searchsorted(place, place, side="right") - row - 1
     one = np.repeat(row, later)
@@ -228,18 +228,22 @@ def _connected(
     other: NDArray[np.int64],
     limit: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Say which pairs of positions a way of at most the pair's limit joins; an edge of -1 is joined to nothing."""
+    """Tell which pairs of positions are connected by a route within the pair's limit; edge -1 is never connected."""
     connected = np.zeros(len(one), bool)
     found = np.flatnonzero((edge[one] >= 0) & (edge[other] >= 0))
     if len(found) == 0:
         return connected
-    i, s, j, t = edge[one[found]], offset[one[found]], edge[other[found]], offset[other[found]]
-    # All four ways from an end of the one edge to an end of the other, shape (4, K), and the one along the same edge.
-    (a, to_a), (b, from_b) = _ends(network, i, s), _ends(network, j, t)
-    a, to_a, b, from_b = a[[0, 0, 1, 1]], to_a[[0, 0, 1, 1]], b[[0, 1, 0, 1]], from_b[[0, 1, 0, 1]]
-    between = _distances(network, a.ravel(), b.ravel(), limit=float(limit[found].max())).reshape(a.shape)
-    way = np.minimum((to_a + between + from_b).min(axis=0), np.where(i == j, np.abs(s - t), np.inf))
-    connected[found] = way <= limit[found] + EPSILON
+    start_edge, start = edge[one[found]], offset[one[found]]
+    stop_edge, stop = edge[other[found]], offset[other[found]]
+    # The four routes from an end of the one edge to an end of the other, shape (4, K), and that along the same edge.
+    (exit_node, to_exit), (entry, from_entry) = _ends(network, start_edge, start), _ends(network, stop_edge, stop)
+    exit_node, to_exit = exit_node[[0, 0, 1, 1]], to_exit[[0, 0, 1, 1]]
+    entry, from_entry = entry[[0, 1, 0, 1]], from_entry[[0, 1, 0, 1]]
+    largest = float(limit[found].max())
+    between = _distances(network, exit_node.ravel(), entry.ravel(), limit=largest).reshape(exit_node.shape)
+    along = np.where(start_edge == stop_edge, np.abs(start - stop), np.inf)
+    route = np.minimum((to_exit + between + from_entry).min(axis=0), along)
+    connected[found] = route <= limit[found] + EPSILON
     return connected
 
 

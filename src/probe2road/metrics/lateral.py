@@ -1,4 +1,4 @@
-"""Lateral error: how far beside the reference's roads do the proposal's lie? In metres, not as a share."""
+"""Lateral error: how far beside the reference's roads do the proposal's roads lie? In metres, not as a share."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class LateralOptions:
     spacing: Positive[float] = 2.0  # m between samples
     radius: Positive[float] = 6.0  # m, the largest distance from a sample to a road of the other graph, inclusive
     max_angle: Positive[float] = 30.0  # degrees between the sample's road and the other, as undirected lines
-    span: Positive[float] = 2.0  # m to either side over which the direction of a road is taken
+    span: Positive[float] = 2.0  # m to either side, over which the direction of a road is measured
 
 
 def lateral(proposal: RoadGraph, reference: RoadGraph, *, options: LateralOptions | None = None) -> Score:
@@ -73,7 +73,7 @@ def lateral(proposal: RoadGraph, reference: RoadGraph, *, options: LateralOption
 
 
 def lateral_networks(proposal: Network, reference: Network, options: LateralOptions) -> Score:
-    """Score normalised networks, as `lateral`."""
+    """Score normalised networks in the same way as `lateral`."""
     _, gap = lateral_gaps(proposal, reference, options=options)
     _, back = lateral_gaps(reference, proposal, options=options)
     error = gap[np.isfinite(gap)]
@@ -97,7 +97,7 @@ def lateral_networks(proposal: Network, reference: Network, options: LateralOpti
 def lateral_gaps(
     network: Network, other: Network, *, options: LateralOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sample a network and measure each sample's distance to the other network's road beside it.
+    """Sample a network, and measure the distance of each sample to the road beside it in the other network.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Pairing the samples of two graphs, one to one."""
+"""Matching of the samples of two graphs, one to one."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def candidate_pairs(
     b_direction: NDArray[np.float64] | None = None,
     max_angle: float | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """List the pairs of points within a radius, and, where asked, along roughly the same line.
+    """List the pairs of points within a radius, optionally only those along roughly the same line.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def match_one_to_one(
 
 @njit(cache=True)
 def _take_in_order(a: NDArray[np.int64], b: NDArray[np.int64], n_a: int, n_b: int) -> NDArray[np.int64]:
-    """Accept pairs in the order given while both of their points are free."""
+    """Accept pairs in the given order, if both of their points are still free."""
     partner = np.full(n_a, -1, np.int64)
     used = np.zeros(n_b, np.bool_)
     for pair in range(len(a)):
@@ -138,7 +138,7 @@ def _take_in_order(a: NDArray[np.int64], b: NDArray[np.int64], n_a: int, n_b: in
 
 @njit(cache=True)
 def _most_pairs(first: NDArray[np.int64], b: NDArray[np.int64], n_b: int) -> NDArray[np.int64]:
-    """Match as many points as possible: every ``a`` in turn takes a free partner, or one whose owner can take another.
+    """Match as many points as possible: every ``a`` takes a free partner, or one whose owner can take another.
 
     The search for such a chain stays among the points that are linked to each other. Those are few, which is why this
     is fast where a general program goes over all points in each of its rounds: on the samples of TOPO on 200 km of
@@ -148,7 +148,7 @@ def _most_pairs(first: NDArray[np.int64], b: NDArray[np.int64], n_b: int) -> NDA
     """
     n_a = len(first) - 1
     partner, owner = np.full(n_a, -1, np.int64), np.full(n_b, -1, np.int64)
-    seen = np.full(n_b, -1, np.int64)  # the last root that came by
+    seen = np.full(n_b, -1, np.int64)  # the last root whose search passed the point
     chain, over, at = np.empty(n_a, np.int64), np.empty(n_a, np.int64), first[:-1].copy()
     free = first[:-1].copy()  # the first pair of each point whose partner may be free; once taken, it stays taken
     for root in range(n_a):

@@ -1,4 +1,4 @@
-"""A road graph as plain arrays, which is what the metrics compute on.
+"""A road graph as plain arrays, on which the metrics compute.
 
 Legend of array shapes: N nodes, E edges, V vertices of all edges one after another, S positions on edges.
 """
@@ -18,12 +18,12 @@ from probe2road.graph.roadgraph import RoadGraph
 
 __all__ = ["EPSILON", "Network", "locate", "network_from_graph", "shortest_arcs"]
 
-EPSILON = 1e-6  # m; positions nearer than this are one: coordinates of 10^6 m resolve 10^-9 m
+EPSILON = 1e-6  # m; positions nearer than this are the same: coordinates of 10^6 m have a resolution of 10^-9 m
 
 
 @dataclass(frozen=True)
 class Network:
-    """Arrays of a road graph, in plan.
+    """Arrays of a road graph in plan.
 
     Attributes
     ----------
@@ -56,17 +56,17 @@ class Network:
 
     @property
     def degree(self) -> NDArray[np.int64]:
-        """Edge ends at every node, shape (N,); a loop counts twice."""
+        """Return the number of edge ends at every node, shape (N,); a loop counts twice."""
         return np.diff(self.incident_first)
 
     @property
     def km(self) -> float:
-        """Total length, kilometres."""
+        """Return the total length, kilometres."""
         return float(self.length.sum()) / 1000.0
 
 
 def network_from_graph(graph: RoadGraph) -> Network:
-    """Turn a road graph into arrays; edge ends are moved exactly onto their nodes, heights are dropped.
+    """Convert a road graph to arrays; edge ends are moved exactly to their nodes, and heights are dropped.
 
     Examples
     --------
@@ -103,7 +103,7 @@ def network_from_graph(graph: RoadGraph) -> Network:
 
 
 def shortest_arcs(a: NDArray[np.int64], b: NDArray[np.int64], size: NDArray[np.float64], n_nodes: int) -> csr_array:
-    """Return the undirected graph of arcs as scipy's routing takes it, the shortest of parallel arcs only.
+    """Return the undirected graph of arcs for scipy's routing, with only the shortest of parallel arcs.
 
     A sparse matrix would add the sizes of parallel arcs up, and take an arc of length 0 for none.
 
@@ -159,17 +159,17 @@ def _locate(
     position, direction = np.empty((len(edge), 2)), np.empty((len(edge), 2))
     for i in range(len(edge)):
         low, high = first[edge[i]], first[edge[i] + 1]
-        b = low + np.searchsorted(along[low:high], offset[i])
-        b = min(max(b, low + 1), high - 1)
-        while b < high - 1 and along[b] == along[b - 1]:  # repeated vertices have no direction
-            b += 1
-        while b > low + 1 and along[b] == along[b - 1]:
-            b -= 1
-        size = along[b] - along[b - 1]
-        share = (offset[i] - along[b - 1]) / size if size > 0 else 0.0
+        vertex = low + np.searchsorted(along[low:high], offset[i])
+        vertex = min(max(vertex, low + 1), high - 1)
+        while vertex < high - 1 and along[vertex] == along[vertex - 1]:  # repeated vertices have no direction
+            vertex += 1
+        while vertex > low + 1 and along[vertex] == along[vertex - 1]:
+            vertex -= 1
+        size = along[vertex] - along[vertex - 1]
+        share = (offset[i] - along[vertex - 1]) / size if size > 0 else 0.0
         share = min(max(share, 0.0), 1.0)
         for axis in range(2):
-            difference = xy[b, axis] - xy[b - 1, axis]
-            position[i, axis] = xy[b, axis] if share == 1.0 else xy[b - 1, axis] + share * difference
+            difference = xy[vertex, axis] - xy[vertex - 1, axis]
+            position[i, axis] = xy[vertex, axis] if share == 1.0 else xy[vertex - 1, axis] + share * difference
             direction[i, axis] = difference / size if size > 0 else 0.0
     return position, direction

@@ -1,4 +1,4 @@
-"""What both graphs go through before any metric: one CRS, one area, no twin edges, no nodes of degree 2."""
+"""Normalisation of both graphs before any metric: one CRS, one area, no twin edges, no nodes of degree 2."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 def comparable(
     proposal: RoadGraph, reference: RoadGraph, *, area: Any = None, merge: bool = True
 ) -> tuple[RoadGraph, RoadGraph]:
-    """Bring two graphs into the form in which they can be compared.
+    """Normalise two graphs so that they can be compared.
 
     Parameters
     ----------
@@ -69,13 +69,13 @@ def comparable(
 def comparable_networks(
     proposal: RoadGraph, reference: RoadGraph, *, area: Any = None, merge: bool = True
 ) -> tuple[Network, Network]:
-    """Return `comparable` graphs as arrays."""
+    """Return two graphs, normalised by `comparable`, as arrays."""
     first, second = comparable(proposal, reference, area=area, merge=merge)
     return network_from_graph(first), network_from_graph(second)
 
 
 def drop_twin_edges(graph: RoadGraph) -> RoadGraph:
-    """Keep one of the edges that join the same nodes along the same line, whichever way they are drawn.
+    """Keep only one of several edges that join the same nodes along the same line, in either direction.
 
     Maps with one edge per direction draw such twins; in an undirected graph they are one road. Roads one above the
     other have different nodes and stay. The first edge is kept as it is; turns are dropped where a twin is.
@@ -97,7 +97,7 @@ def drop_twin_edges(graph: RoadGraph) -> RoadGraph:
 
 
 def clip_graph(graph: RoadGraph, area: Any) -> RoadGraph:
-    """Keep what lies within an area; roads that leave it are cut at its border and end in new nodes there.
+    """Keep the part of a graph within an area; roads are cut at the border and end there in new nodes.
 
     Nodes keep their identity, so roads that cross without meeting still do not meet. Pieces shorter than a
     micrometre are left out, and so are nodes that lose all their edges. Turns are dropped.
@@ -172,7 +172,7 @@ def _with_pieces(
     begin: NDArray[np.float64],
     end: NDArray[np.float64],
 ) -> RoadGraph:
-    """Build the graph of whole edges and of pieces of others; cut ends get nodes of their own."""
+    """Build a graph from whole edges and from pieces of others; the cut ends get new nodes."""
     cut_begin, cut_end = begin > EPSILON, end < network.length[edge] - EPSILON
     node_ids = graph.nodes.index.to_numpy()
     spare = (node_ids.max() if len(node_ids) else -1) + 1
@@ -199,7 +199,7 @@ def _with_pieces(
 
 
 def _piece(line: shapely.LineString, begin: float, end: float) -> shapely.LineString:
-    """Cut a line between two offsets in plan, heights interpolated."""
+    """Cut a line at two offsets in plan, and interpolate heights there."""
     coordinates = shapely.get_coordinates(line, include_z=bool(line.has_z))
     step = np.hypot(*np.diff(coordinates[:, :2], axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(step)])

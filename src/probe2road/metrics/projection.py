@@ -1,4 +1,4 @@
-"""Points of one graph looked up on another: the nearest edge that runs along the same line."""
+"""Projection of points of one graph on the other: on the nearest edge along the same line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def project_along(
     max_angle: float,
     span: float = 0.0,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Find the nearest edge that runs along each point's direction, and where on it the point projects to.
+    """Find the nearest edge in each point's direction, and the position on it to which the point projects.
 
     Each edge within the radius is represented by its position nearest to the point; those that run across the
     direction there are left out. Among equally near edges the lowest is taken.
@@ -73,7 +73,7 @@ def project_along(
 def direction_over(
     network: Network, edge: NDArray[np.int64], offset: NDArray[np.float64], span: float
 ) -> NDArray[np.float64]:
-    """Return the unit direction of edges at positions, from ``span`` metres before to as many behind, shape (S, 2).
+    """Return the unit direction of edges at positions, over ``span`` metres before and after, shape (S, 2).
 
     Traced lines have steps of a pixel, so that a segment says little about where its road leads. The chord is shorter
     at the ends of an edge. A span of 0 gives the direction of the segment; a chord that closes has direction 0.

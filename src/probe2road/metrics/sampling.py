@@ -1,4 +1,4 @@
-"""Points on graphs: along every edge, and outward from a centre up to a network distance.
+"""Sampling of graphs: points along every edge, and outward from a centre up to a network distance.
 
 Strategy of `sample_around`. From each centre (a node, or a position on an edge) Dijkstra's algorithm finds the
 network distance of every node in reach. Along an edge that distance rises away from the centre, so an edge
@@ -30,7 +30,7 @@ __all__ = ["Centres", "Samples", "component_roots", "sample_around", "sample_edg
 
 @dataclass(frozen=True)
 class Centres:
-    """Centres to sample around, one of three kinds each.
+    """Centres of sampling, each of one of three kinds.
 
     Attributes
     ----------
@@ -46,12 +46,12 @@ class Centres:
 
     @classmethod
     def from_nodes(cls, node: NDArray[np.int64]) -> Centres:
-        """Centre on nodes."""
+        """Return centres at nodes."""
         return cls(np.asarray(node, np.int64), np.full(len(node), -1, np.int64), np.zeros(len(node)))
 
     @classmethod
     def from_positions(cls, edge: NDArray[np.int64], offset: NDArray[np.float64]) -> Centres:
-        """Centre on positions on edges; an edge of -1 has no samples."""
+        """Return centres at positions on edges; a centre on edge -1 has no samples."""
         return cls(np.full(len(edge), -1, np.int64), np.asarray(edge, np.int64), np.asarray(offset, np.float64))
 
 
@@ -77,7 +77,7 @@ class Samples:
 
 
 def sample_edges(network: Network, spacing: float, *, shift: float | None = None) -> Samples:
-    """Sample every edge at its start, then every ``spacing`` metres, and at its end; shared points once.
+    """Sample every edge at its start, at every ``spacing`` metres, and at its end; shared points appear once.
 
     The end is always sampled, so the last interval may be short. Polyline vertices are not kept. A spacing that
     is not positive gives no samples.
@@ -124,7 +124,7 @@ def sample_edges(network: Network, spacing: float, *, shift: float | None = None
 
 
 def sample_around(network: Network, centres: Centres, *, radius: float, spacing: float, ends: bool = True) -> Samples:
-    """Sample the part of a graph within a network distance of each centre, from the centre outward.
+    """Sample the part of a graph within a network distance of each centre, in order from the centre outward.
 
     Parameters
     ----------
@@ -184,9 +184,9 @@ def _samples(
 
 
 class _Roads(NamedTuple):
-    """Stretches of road between nodes: the edges, and behind them two halves of the edge that has the centre on it.
+    """Stretches of road between nodes: all edges, then two halves of the edge that the centre is on.
 
-    R = E + 2 stretches; the node behind all others is the centre on an edge, where the two halves begin.
+    There are R = E + 2 stretches. The last node is the centre on an edge, where the two halves begin.
     """
 
     u: NDArray[np.int64]  # (R,)
@@ -199,14 +199,14 @@ class _Roads(NamedTuple):
 
 
 class _Reached(NamedTuple):
-    """What Dijkstra's algorithm knows of every node, shape (N + 1,) each; cleared behind each centre."""
+    """The state of Dijkstra's algorithm at every node, shape (N + 1,) each; reset after each centre."""
 
     distance: NDArray[np.float64]  # m
     over: NDArray[np.int64]  # stretch over which the node was reached; -1 for the centre
 
 
 class _Sink(NamedTuple):
-    """Where samples go: growing lists, and the last centre for which each node was sampled, shape (N + 1,)."""
+    """The collected samples as growing lists, and the last centre that sampled each node, shape (N + 1,)."""
 
     edge: list[int]
     offset: list[float]
@@ -214,7 +214,7 @@ class _Sink(NamedTuple):
 
 
 class _Limits(NamedTuple):
-    """See `sample_around`."""
+    """The limits of sampling; see `sample_around`."""
 
     radius: float
     spacing: float
@@ -222,17 +222,17 @@ class _Limits(NamedTuple):
 
 
 class _Branch(NamedTuple):
-    """A branch on one edge: it enters at an offset, at a network distance, and goes on to another distance."""
+    """A part of an edge to sample: its start (offset, network distance), and its end (network distance)."""
 
     edge: int
     offset: float  # m
-    sign: float  # of the offset, going on
+    sign: float  # 1 if the offset grows along the branch, else -1
     distance: float  # m
     stop: float  # m, network distance
 
 
 def _roads(network: Network) -> _Roads:
-    """Make room for a centre on an edge in the arrays of a network."""
+    """Return the stretches of a network, with space for the halves of the edge that a centre is on."""
     n_edges = len(network.u)
     spare = np.zeros(2, np.int64)
     return _Roads(
@@ -254,7 +254,7 @@ def _sample_around(
     roads: _Roads,
     limits: _Limits,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Collect the samples of all centres, see `Centres`; the strategy stands at the head of the module."""
+    """Collect the samples around all centres (see `Centres`); the strategy is at the top of the module."""
     n_nodes = len(roads.incident_first) - 1
     reached = _Reached(np.full(n_nodes, np.inf), np.full(n_nodes, -1, np.int64))
     sink = _new_sink(n_nodes)
@@ -285,7 +285,7 @@ def _sample_around(
 
 @njit(cache=True)
 def _new_sink(n_nodes: int) -> _Sink:
-    """Return a sink without samples.
+    """Return empty lists of samples.
 
     The comprehensions, which tell the compiler the types of empty lists, stand apart, because numba drops writes to
     the arrays of a local named tuple, as in ``reached.distance[n] = 0.0``, from a function that holds one.
@@ -295,7 +295,7 @@ def _new_sink(n_nodes: int) -> _Sink:
 
 @njit(cache=True)
 def _split(roads: _Roads, edge: int, offset: float) -> None:
-    """Put the centre on an edge: its halves lead from the centre to u and to v, where they take the edge's place."""
+    """Replace an edge by two halves that lead from the centre on it to u and to v."""
     offset = min(max(offset, 0.0), roads.end[edge])
     for side in range(2):
         half = len(roads.u) - 2 + side
@@ -303,14 +303,14 @@ def _split(roads: _Roads, edge: int, offset: float) -> None:
         roads.u[half], roads.v[half], roads.edge[half] = len(roads.incident_first) - 2, node, edge
         roads.begin[half], roads.end[half] = offset, stop
         for k in range(roads.incident_first[node], roads.incident_first[node + 1]):
-            if roads.incident[k] == edge:  # a loop stands there twice, once for each half
+            if roads.incident[k] == edge:  # a loop is listed twice, once for each half
                 roads.incident[k] = half
                 break
 
 
 @njit(cache=True)
 def _mend(roads: _Roads) -> None:
-    """Put the edge back in the place of its halves."""
+    """Replace the two halves by their edge again."""
     for half in range(len(roads.u) - 2, len(roads.u)):
         node = roads.v[half]
         for k in range(roads.incident_first[node], roads.incident_first[node + 1]):
@@ -320,7 +320,7 @@ def _mend(roads: _Roads) -> None:
 
 @njit(cache=True)
 def _sample_centre(roads: _Roads, root: int, sink: _Sink, centre: int) -> None:
-    """Sample a centre on an edge, and with it the end of the edge where it lies there."""
+    """Sample a centre on an edge; a node at the same position then counts as sampled, too."""
     sink.node_seen[root] = centre
     half = roads.incident[roads.incident_first[root]]
     sink.edge.append(roads.edge[half])
@@ -333,7 +333,7 @@ def _sample_centre(roads: _Roads, root: int, sink: _Sink, centre: int) -> None:
 
 @njit(cache=True)
 def _reach(root: int, radius: float, roads: _Roads, reached: _Reached) -> list[int]:
-    """Fill what is known of every node within the radius of a node (-1: of none); list them nearest first."""
+    """Compute the distances of all nodes within the radius of a node (-1 for none); list the nodes, nearest first."""
     heap = [(0.0, 0) for _ in range(0)]
     settled = [0 for _ in range(0)]
     if root >= 0:
@@ -356,7 +356,7 @@ def _reach(root: int, radius: float, roads: _Roads, reached: _Reached) -> list[i
 
 @njit(cache=True, inline="always")
 def _is_sample(n: int, root: int, roads: _Roads, reached: _Reached, limits: _Limits) -> bool:
-    """Say whether a node in reach is a sample: at a multiple of the spacing, or as a dead end."""
+    """Tell whether a reached node is a sample: at a multiple of the spacing, or as a dead end."""
     level = limits.spacing * np.round(reached.distance[n] / limits.spacing)
     dead_end = roads.incident_first[n + 1] - roads.incident_first[n] == 1 and n != root
     return abs(reached.distance[n] - level) <= EPSILON or (limits.ends and dead_end)
@@ -364,7 +364,7 @@ def _is_sample(n: int, root: int, roads: _Roads, reached: _Reached, limits: _Lim
 
 @njit(cache=True, inline="always")
 def _sample_node(n: int, roads: _Roads, reached: _Reached, sink: _Sink, centre: int) -> None:
-    """Sample a node as an end of the edge over which it was reached; the centre as one of its first edge, if any."""
+    """Sample a node as an end of the edge over which it was reached; the centre as an end of its first edge."""
     stretch = reached.over[n]
     if stretch < 0:
         if roads.incident_first[n] == roads.incident_first[n + 1]:
@@ -378,10 +378,10 @@ def _sample_node(n: int, roads: _Roads, reached: _Reached, sink: _Sink, centre: 
 
 @njit(cache=True)
 def _walk(stretch: int, roads: _Roads, reached: _Reached, limits: _Limits, sink: _Sink, centre: int) -> None:
-    """Sample the branches on a stretch.
+    """Sample the parts of a stretch that are in reach.
 
-    Where one end was reached over this very stretch, one branch passes through, and the node behind is sampled as a
-    node. Otherwise branches enter from both ends in reach, up to where they meet or to the radius.
+    If one end was reached over this stretch, one branch passes through, and the node at its end is sampled separately.
+    Otherwise branches enter from both ends that are in reach, and stop where they meet or at the radius.
     """
     u, v, edge = roads.u[stretch], roads.v[stretch], roads.edge[stretch]
     begin, end = roads.begin[stretch], roads.end[stretch]
@@ -403,13 +403,13 @@ def _walk(stretch: int, roads: _Roads, reached: _Reached, limits: _Limits, sink:
     if at_v < np.inf:
         branch = _Branch(edge, end, back, at_v, stop)
         _sample_levels(branch, limits.spacing, sink)
-        if limits.ends and not meets:  # else the end is that of the other branch
+        if limits.ends and not meets:  # else the other branch has sampled this end
             _sample_end(branch, roads, sink, centre)
 
 
 @njit(cache=True, inline="always")
 def _sample_levels(branch: _Branch, spacing: float, sink: _Sink) -> None:
-    """Sample a branch at the multiples of the spacing, its ends not included."""
+    """Sample a branch at multiples of the spacing, without its ends."""
     level = spacing * (np.floor((branch.distance + EPSILON) / spacing) + 1.0)
     while level < branch.stop - EPSILON:
         sink.edge.append(branch.edge)
@@ -419,7 +419,7 @@ def _sample_levels(branch: _Branch, spacing: float, sink: _Sink) -> None:
 
 @njit(cache=True, inline="always")
 def _sample_end(branch: _Branch, roads: _Roads, sink: _Sink, centre: int) -> None:
-    """Sample the place where a branch ends, unless it is a node that is sampled already."""
+    """Sample the end of a branch, unless it is a node that was sampled before."""
     offset = branch.offset + branch.sign * (branch.stop - branch.distance)
     node = -1
     if offset <= EPSILON:

@@ -1,4 +1,4 @@
-"""The score of one metric, and the tidy table of many."""
+"""The score of one metric, and the tidy table of several scores."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ SCORE_DTYPES = {
     "recall": "float64",
     "f1": "float64",
     "matched_proposal": "float64",  # samples, pixels, pairs or metres of the proposal that found a partner
-    "proposal": "float64",  # ... of all there are
-    "matched_reference": "float64",  # the same, seen from the reference; equal where matching is one-to-one
+    "proposal": "float64",  # all samples, pixels, pairs or metres of the proposal
+    "matched_reference": "float64",  # the same for the reference; equal if matching is one-to-one
     "reference": "float64",
     "parameters": "str",  # JSON, every parameter of the metric
     "details": "str",  # JSON, facts to read beside the score: node counts, lengths
@@ -27,7 +27,7 @@ SCORE_DTYPES = {
 
 @dataclass(frozen=True)
 class Score:
-    """What one metric says about a proposal.
+    """The result of one metric for a proposal.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Score:
         parameters: Mapping[str, Any],
         details: Mapping[str, Any] | None = None,
     ) -> Score:
-        """Build the score whose precision and recall are ratios of pooled counts."""
+        """Build a score whose precision and recall are ratios of pooled counts."""
         precision, recall = ratio(matched_proposal, proposal), ratio(matched_reference, reference)
         return cls(
             metric,
@@ -81,7 +81,7 @@ class Score:
 
     @property
     def f1(self) -> float:
-        """Harmonic mean of precision and recall."""
+        """Return the harmonic mean of precision and recall."""
         return f_score(self.precision, self.recall)
 
     def __str__(self) -> str:
@@ -90,7 +90,7 @@ class Score:
 
 
 def ratio(part: float, whole: float) -> float:
-    """Divide, where nothing out of nothing is 0: an empty graph scores 0, never NaN.
+    """Return a quotient, and 0 for 0 / 0: an empty graph scores 0, never NaN.
 
     Examples
     --------
@@ -112,7 +112,7 @@ def f_score(precision: float, recall: float) -> float:
 
 
 def scores_table(scores: Iterable[Score]) -> pd.DataFrame:
-    """Lay scores out as a tidy table, one row each, with the columns and types of `SCORE_DTYPES`.
+    """Return scores as a tidy table, one row each, with the columns and types of `SCORE_DTYPES`.
 
     Examples
     --------

@@ -22,7 +22,7 @@ def soft_f1(
     *,
     size: int = 2,
 ) -> Score:
-    """Compare masks pixel by pixel after dilating both with a small square; pixels of all tiles are pooled.
+    """Compare masks pixel by pixel after dilating both with a small square; the pixels of all tiles are pooled.
 
     An empty mask scores 0. The proposal is not thinned; a prediction wider than the reference loses precision,
     so thin it before for the other reading, and report both.

@@ -1,4 +1,4 @@
-"""TOPO: does a drive from the same place reach the same places? Holes and marbles, in metres.
+"""TOPO: does a drive from the same place reach the same places? With holes and marbles, in metres.
 
 Strategy. From starts spread along the reference, and their partners on the proposal, marbles are dropped at
 regular network distances on both graphs (`sample_around`) and matched one to one. All starts of a batch form one
@@ -26,7 +26,7 @@ from probe2road.options import checked
 
 __all__ = ["TopoOptions", "topo", "topo_networks"]
 
-_BATCH = 512  # starts matched together; bounds memory
+_BATCH = 512  # starts that are matched together; limits memory
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class TopoOptions:
     spacing: Positive[float] = 5.5  # m of network distance between marbles
     radius: Positive[float] = 11.0  # m, the largest distance of a match
     max_angle: Positive[float] = 45.0  # degrees between the roads of two matched marbles, as undirected lines
-    margin: Annotated[float, AtLeast(0), Below(0.5)] = 0.0  # share a side without starts; Sat2Graph has 0.07
+    margin: Annotated[float, AtLeast(0), Below(0.5)] = 0.0  # share at each side without starts; Sat2Graph has 0.07
 
 
 def topo(proposal: RoadGraph, reference: RoadGraph, *, options: TopoOptions | None = None) -> Score:
-    """Score what can be reached from the same places.
+    """Score whether the same places can be reached from the same starts.
 
     Both graphs are normalised first, as for `geo`. An empty graph scores 0.
 
@@ -85,7 +85,7 @@ def topo(proposal: RoadGraph, reference: RoadGraph, *, options: TopoOptions | No
 
 
 def topo_networks(proposal: Network, reference: Network, options: TopoOptions) -> Score:
-    """Score normalised networks, as `topo`."""
+    """Score normalised networks in the same way as `topo`."""
     starts = _starts(reference, options)
     edge, offset = project_along(
         starts.xy, starts.direction, proposal, radius=options.start_radius, max_angle=options.start_angle
@@ -125,7 +125,7 @@ def topo_networks(proposal: Network, reference: Network, options: TopoOptions) -
 
 
 def _starts(reference: Network, options: TopoOptions) -> Samples:
-    """Spread starts over the reference, at multiples of the spacing from the root of each component."""
+    """Distribute starts over the reference, at multiples of the spacing from the root of each component."""
     roots = Centres.from_nodes(component_roots(reference))
     starts = sample_around(reference, roots, radius=np.inf, spacing=options.start_spacing, ends=False)
     if len(starts.edge) == 0:
@@ -139,7 +139,7 @@ def _starts(reference: Network, options: TopoOptions) -> Samples:
 
 
 def _matched_marbles(marbles: Samples, holes: Samples, options: TopoOptions) -> NDArray[np.int64]:
-    """Count the matches of each start: as many pairs of marble and hole as can be had one to one."""
+    """Count the matches of each start: the largest number of one-to-one pairs of a marble and a hole."""
     orders = [
         np.lexsort((s.xy[:, 0], np.repeat(np.arange(len(s.first) - 1), np.diff(s.first)))) for s in (marbles, holes)
     ]
@@ -164,7 +164,7 @@ def _pairs_of_starts(
     radius: float,
     cosine: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """List the pairs of points of the same start that are near and along one line; points ascend in x per start."""
+    """List the near pairs of points of the same start along one line; the points of a start are sorted by x."""
     a_of_pair, b_of_pair = [0 for _ in range(0)], [0 for _ in range(0)]
     for start in range(len(a_first) - 1):
         low = b_first[start]

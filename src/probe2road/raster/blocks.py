@@ -1,4 +1,4 @@
-"""Rasters whose memory follows what was written to them, not the box around it.
+"""Rasters whose memory grows with the pixels written, not with their bounding box.
 
 Strategy
 --------
@@ -95,7 +95,7 @@ class Blocks:
             self._block(block)[row[place] % self.side, col[place] % self.side] = value
 
     def nonzero(self, at_least: float | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the rows and columns of all pixels that are set, or reach a value above 0, in reading order."""
+        """Return the rows and columns of all pixels that are set, or at least ``at_least``, in reading order."""
         rows, cols = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
         for _, row_of_blocks in groupby(self._in_order(), lambda entry: entry[0][0]):
             found = []
@@ -109,17 +109,17 @@ class Blocks:
         return np.concatenate(rows), np.concatenate(cols)
 
     def windows(self) -> Iterator[tuple[int, int, NDArray[Any]]]:
-        """Yield the first row, the first column and the pixels of every block that is there, in reading order."""
+        """Yield the first row, the first column and the pixels of every stored block, in reading order."""
         for (i, j), pixels in self._in_order():
             yield i * self.side, j * self.side, pixels
 
     def any_in(self, top: int, left: int, rows: int, cols: int) -> bool:
-        """Say whether a pixel of a rectangle is set."""
+        """Tell whether any pixel of a rectangle is set."""
         spans = self._overlaps(top, min(top + rows, self.shape[0]), left, min(left + cols, self.shape[1]))
         return any(block in self.filled and self.filled[block][inside].any() for block, inside, _ in spans)
 
     def squares(self, size: int) -> list[tuple[int, int]]:
-        """Return the first pixels of those squares of ``size`` pixels that a block reaches into, in reading order."""
+        """Return the first pixels of the squares of ``size`` pixels that overlap a stored block, in reading order."""
         found = {
             (row, col)
             for top, left, pixels in self.windows()
@@ -129,7 +129,7 @@ class Blocks:
         return [(row * size, col * size) for row, col in sorted(found)]
 
     def _block(self, block: tuple[int, int]) -> NDArray[Any]:
-        """Return a block, made where it is not there; blocks at the far edges are smaller."""
+        """Return a block, which is created if it is missing; blocks at the far edges are smaller."""
         if block not in self.filled:
             rows, cols = (min(self.side, n - k * self.side) for n, k in zip(self.shape, block, strict=True))
             self.filled[block] = np.zeros((rows, cols), self.dtype)
@@ -142,7 +142,7 @@ class Blocks:
     def _grouped(
         self, row: NDArray[np.int64], col: NDArray[np.int64]
     ) -> Iterator[tuple[tuple[int, int], NDArray[np.int64]]]:
-        """Yield the blocks that single pixels lie in, and which pixels."""
+        """Yield each block that holds some of the given pixels, and which pixels these are."""
         i, j = row // self.side, col // self.side
         number = i * (self.shape[1] // self.side + 1) + j
         order = np.argsort(number, kind="stable")
@@ -158,7 +158,7 @@ class Blocks:
     def _overlaps(
         self, top: int, bottom: int, left: int, right: int
     ) -> Iterator[tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]]:
-        """Yield the blocks of a rectangle, with the part inside the block and that inside the rectangle."""
+        """Yield the blocks that overlap a rectangle, with the overlap inside the block and inside the rectangle."""
         for i in range(top // self.side, -(-bottom // self.side)):
             low, high = max(top, i * self.side), min(bottom, (i + 1) * self.side)
             for j in range(left // self.side, -(-right // self.side)):

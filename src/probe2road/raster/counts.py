@@ -1,4 +1,4 @@
-"""Fleet data to count rasters: how many traces, lane markings and road boundaries each pixel has seen.
+"""From fleet data to count rasters: how many traces, lane markings and road boundaries each pixel has.
 
 Strategy
 --------
@@ -21,8 +21,8 @@ from scipy import ndimage
 from probe2road.crs import require_same_crs
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks, without_strays
+from probe2road.raster.drawing import draw_line
 from probe2road.raster.grid import Grid, Window, sparse_zeros
-from probe2road.raster.lines import draw_line
 
 __all__ = [
     "CHANNELS",
@@ -41,11 +41,11 @@ logger = logging.getLogger(__name__)
 CHANNELS = ("traces", "lane_markings", "road_boundaries")  # the paper's A, B, C
 
 _CACHED_WINDOW = 1024  # pixels; three channels of one row block stay in the processor's cache
-_KEEP = np.uint32(0xFFFFFFFF)  # all bits: lines add to what is there
+_KEEP = np.uint32(0xFFFFFFFF)  # all bits: lines add to the value of a pixel
 
 _MOST_PIXELS = 20_000_000_000  # where the fleet drove; a byte each is all the memory of a large computer
 _LONGEST_SIDE = 2**31 - 1  # px, that a GeoTIFF can have
-_PLACE = 100.0  # m, side of the squares that tell where the fleet drove
+_PLACE = 100.0  # m, side of the squares that show where the fleet drove
 
 
 def fleet_grid(fleet: Fleet, *, resolution: float = 1.0, margin: float = 50.0) -> Grid:
@@ -90,7 +90,7 @@ def rasterize(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> NDA
     grid
         Where and how finely to count.
     gaps
-        Where traces are broken; the default limits where it is None.
+        Where traces are broken; the default limits if it is None.
 
     Returns
     -------
@@ -118,7 +118,7 @@ def rasterize(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> NDA
            [1, 1, 1, 0, 0]], dtype=uint32)
     """
     counts = sparse_zeros((len(CHANNELS), *grid.shape), np.uint32)
-    seen = slice(None) if len(fleet.points) else slice(1)  # pages of a channel nobody writes to take no memory
+    seen = slice(None) if len(fleet.points) else slice(1)  # pages of a channel that is never written use no memory
     for window, part in rasterize_windows(fleet, grid, size=_CACHED_WINDOW, gaps=gaps):
         counts[seen, *window.core] = part[seen]
     return counts
@@ -127,7 +127,7 @@ def rasterize(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> NDA
 def rasterize_windows(
     fleet: Fleet, grid: Grid, *, size: int = 1024, halo: int = 0, gaps: TraceGaps | None = None
 ) -> Iterator[tuple[Window, NDArray[np.uint32]]]:
-    """Rasterise window by window, with memory for one window at a time.
+    """Rasterize a fleet window by window, with memory for one window at a time.
 
     Windows that neither a trace nor a semantic point touches, halo included, are skipped.
 
@@ -152,7 +152,7 @@ def rasterize_windows(
     point_row, point_col = grid.rowcol(fleet.points["x"], fleet.points["y"])
     channel = fleet.points["kind"].cat.codes.to_numpy(np.int64) + 1  # the channels follow POINT_KINDS
     single = np.ones(len(point_row), bool)
-    # Where a fleet is in two cities, the table of windows has no row and no column for what lies between them.
+    # For a fleet in two cities, the table of windows has no rows and columns for the area between the cities.
     rows, cols = (
         np.flatnonzero(
             _touched(place, breaks, size, halo, -(-n // size)) | _touched(other, single, size, halo, -(-n // size))
@@ -184,7 +184,7 @@ def count_pixels(
     kind: NDArray[np.int64],
     shape: tuple[int, int],
 ) -> NDArray[np.uint32]:
-    """Count traces and points that are in pixel coordinates already; see `rasterize`.
+    """Count traces and points that are already in pixel coordinates; see `rasterize`.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def count_pixels(
 def _touched(
     place: NDArray[np.int64], breaks: NDArray[np.bool_], size: int, halo: int, n_windows: int
 ) -> NDArray[np.bool_]:
-    """Mark, along one axis, the windows that a segment from the fix before may touch; see `_members_of_windows`."""
+    """Mark the windows along one axis that a segment may touch; see `_members_of_windows`."""
     touched = np.zeros(n_windows, np.bool_)
     for fix in range(len(place)):
         before = fix if breaks[fix] else fix - 1
@@ -230,7 +230,7 @@ def _touched(
 
 
 def _ranks(windows: NDArray[np.int64], n_windows: int) -> NDArray[np.int64]:
-    """Return the place of each window along one axis among those that are touched; -1 for the others."""
+    """Return the number of each window along one axis among the touched ones; -1 for the others."""
     ranks = np.full(n_windows, -1, np.int64)
     ranks[windows] = np.arange(len(windows))
     return ranks
@@ -246,7 +246,7 @@ def _members_of_windows(
     row_ranks: NDArray[np.int64],
     col_ranks: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """List, for each window of a regular table, the fixes whose segment from the fix before may touch it.
+    """List the fixes whose segment from the fix before may touch a window, for each window of a regular table.
 
     A fix behind a break stands for itself alone. The ranks number the rows and columns of windows that are touched;
     the others are not in the table. Returns CSR arrays: offsets ``(n_windows + 1,)``, windows row by row, and the
@@ -270,7 +270,7 @@ def _members_of_windows(
             left, right = max(0, (low_col - halo) // size), min(all_cols - 1, (high_col + halo) // size)
             if top > bottom or left > right:
                 continue
-            top, bottom = row_ranks[top], row_ranks[bottom]  # what lies between them is touched, too
+            top, bottom = row_ranks[top], row_ranks[bottom]  # windows between them are touched, too
             left, right = col_ranks[left], col_ranks[right]
             if fill == 0 and top == bottom and left == right:
                 only[fix] = top * window_cols + left
@@ -300,7 +300,7 @@ def _draw_segments(
     left: int,
     counts: NDArray[np.uint32],
 ) -> None:
-    """Add the segments that end at the given fixes to counts ``(rows, cols)``, whose corner is (top, left).
+    """Add the segments that end at the given fixes to counts ``(rows, cols)`` with the corner (top, left).
 
     The pixel that a segment was driven from belongs to the segment before.
     """
@@ -323,7 +323,7 @@ def _draw_segments(
 def _count_points(
     row: NDArray[np.int64], col: NDArray[np.int64], channel: NDArray[np.int64], counts: NDArray[np.uint32]
 ) -> None:
-    """Add points to counts ``(channel, rows, cols)``; those outside are left out."""
+    """Add points to counts ``(channel, rows, cols)``; points outside are ignored."""
     _, rows, cols = counts.shape
     for point in range(len(row)):
         if 0 <= row[point] < rows and 0 <= col[point] < cols:
@@ -331,16 +331,16 @@ def _count_points(
 
 
 def without_rare(counts: NDArray[np.uint32], grid: Grid, *, least: int) -> NDArray[np.uint32]:
-    """Return counts without what few traces stand behind, for pictures that leave the house.
+    """Return counts without the pixels that few traces passed, for pictures to be published.
 
     Parameters
     ----------
     counts
         From `rasterize`, shape ``(channel, row, col)``.
     grid
-        Where they are.
+        Grid of the counts.
     least
-        Traces that a pixel needs. Semantic points stay where such a pixel is within 20 m. 1 keeps everything.
+        Fewest traces of a pixel that is kept. Semantic points stay within 20 m of such a pixel. 1 keeps everything.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Pixel grids in a metric CRS, their windows, and their files."""
+"""Pixel grids in a metric CRS, their windows, and raster files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from probe2road.raster.blocks import Blocks
 __all__ = ["Grid", "Window", "read_blocks", "read_raster", "read_tag", "sparse_zeros", "write_raster"]
 
 _TILE, _LARGEST_TILE = 256, 4096  # px, side of a tile of a file
-_MOST_TILES = 2**18  # of a file; each takes 16 bytes even where it is empty
+_MOST_TILES = 2**18  # in one file; each takes 16 bytes even if it is empty
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """``(rows, cols)``."""
+        """Return ``(rows, cols)``."""
         return self.rows, self.cols
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """``(left, bottom, right, top)``, metres."""
+        """Return ``(left, bottom, right, top)``, metres."""
         return (
             self.left,
             self.top - self.rows * self.resolution,
@@ -90,19 +90,19 @@ class Grid:
         return row.astype(np.int64), col.astype(np.int64)
 
     def xy(self, row: ArrayLike, col: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the centres of pixels, which may be fractional."""
+        """Return the positions of pixel centres; rows and columns may be fractional."""
         x = self.left + (np.asarray(col, np.float64) + 0.5) * self.resolution
         y = self.top - (np.asarray(row, np.float64) + 0.5) * self.resolution
         return x, y
 
     def window(self, row: int, col: int, rows: int, cols: int) -> Grid:
-        """Return the grid of a rectangle of pixels, which may reach outside."""
+        """Return the grid of a rectangle of pixels, which may extend beyond this grid."""
         return Grid(
             self.left + col * self.resolution, self.top - row * self.resolution, self.resolution, rows, cols, self.crs
         )
 
     def windows(self, size: int, *, halo: int = 0) -> list[Window]:
-        """Cut the grid into square windows of ``size`` pixels (less at the far edges), row by row."""
+        """Cut the grid into square windows of ``size`` pixels (smaller at the far edges), row by row."""
         return [
             Window(row, col, min(size, self.rows - row), min(size, self.cols - col), halo)
             for row in range(0, self.rows, size)
@@ -112,7 +112,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Window:
-    """A rectangle of a grid's pixels that one pass answers for, and the context around it that it looks at."""
+    """A rectangle of a grid that is processed in one pass, and the context around it that the pass needs."""
 
     row: int
     col: int
@@ -122,12 +122,12 @@ class Window:
 
     @property
     def core(self) -> tuple[slice, slice]:
-        """Rows and columns of the window in an array of the whole grid."""
+        """Return the rows and columns of the window in an array of the whole grid."""
         return slice(self.row, self.row + self.rows), slice(self.col, self.col + self.cols)
 
     @property
     def inner(self) -> tuple[slice, slice]:
-        """Rows and columns of the window in an array that has the halo around it."""
+        """Return the rows and columns of the window in an array that includes the halo."""
         return slice(self.halo, self.halo + self.rows), slice(self.halo, self.halo + self.cols)
 
     def grid(self, grid: Grid) -> Grid:
@@ -145,7 +145,7 @@ def write_raster(
     nodata: float | None = None,
     tags: Mapping[str, str] | None = None,
 ) -> None:
-    """Write a raster as a compressed, tiled GeoTIFF that QGIS opens in place; the file is complete or absent.
+    """Write a raster as a compressed, tiled GeoTIFF that QGIS can open; the file is complete or absent.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def write_raster(
 
 
 def _tiles(grid: Grid) -> dict[str, int]:
-    """Return the size of a file's tiles: of 256 pixels unless their list alone would be large."""
+    """Return the tile size of a file: 256 pixels, or more if the list of tiles alone would be large."""
     side = _TILE
     while -(-grid.rows // side) * -(-grid.cols // side) > _MOST_TILES and side < _LARGEST_TILE:
         side *= 2
@@ -202,7 +202,7 @@ def _tiles(grid: Grid) -> dict[str, int]:
 
 
 def sparse_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return zeros that take memory only where they are written to.
+    """Return an array of zeros that uses memory only where it is written to.
 
     An ordinary large array of zeros comes in pages of 2 MB, because numpy asks the system for large ones. A few windows
     written along a road then fill all of it. Here pages have their ordinary size of some kilobytes, on systems that map
@@ -218,14 +218,14 @@ def sparse_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     if size == 0 or not hasattr(mmap, "MAP_PRIVATE"):
         return np.zeros(shape, dtype)
-    # Where the system keeps account of memory that was asked for, this is not to be counted before it is used.
+    # Systems that limit reserved memory should not count this array before it is used.
     unreserved = getattr(mmap, "MAP_NORESERVE", 0)
     memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | unreserved)
     return np.frombuffer(memory, dtype).reshape(shape)
 
 
 def read_tag(path: str | Path, name: str) -> str | None:
-    """Return a note that `write_raster` put into a file; None where there is none, or no readable file."""
+    """Return a note that `write_raster` put into a file; None without a note or a readable file."""
     import rasterio
 
     try:
@@ -237,7 +237,7 @@ def read_tag(path: str | Path, name: str) -> str | None:
 
 
 def read_blocks(path: str | Path) -> tuple[Blocks, Grid]:
-    """Read the first band of a north-up GeoTIFF and its grid; tiles that are not in the file take no memory.
+    """Read the first band of a north-up GeoTIFF and its grid; tiles that are missing in the file use no memory.
 
     Raises
     ------

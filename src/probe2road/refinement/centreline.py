@@ -46,7 +46,7 @@ __all__ = ["CentrelineOptions", "refine_centreline"]
 
 logger = logging.getLogger(__name__)
 
-_STEPS = (1.0, 0.5, 0.25, 0.0)  # shares of its shift that an edge is tried with until it does not fold
+_STEPS = (1.0, 0.5, 0.25, 0.0)  # shares of the shift of an edge that are tried, until the edge does not fold
 
 
 @dataclass(frozen=True)
@@ -58,14 +58,14 @@ class CentrelineOptions:
     reach: NotNegative[float] = 80.0  # m; wiggles of the shift that are shorter are levelled
     max_shift: NotNegative[float] = 5.0  # m
     max_left: NotNegative[float] = 20.0  # m; fixes farther aside do not vote
-    prior_sigma: Positive[float] = 4.0  # m, by which the present course is expected to be off
+    prior_sigma: Positive[float] = 4.0  # m, expected error of the present course
     vote_sigma: Positive[float] = 1.5  # m, least spread of votes about the middle, lanes included
     min_traces: NotNegative[int] = 3  # on an edge; with fewer it stays
     two_way_share: Share = 0.1  # of the votes that the rarer direction has on a road driven both ways
     max_gap: NotNegative[float] = 6.0  # m between the two directions; an edge with more is two roads, and stays
     fade: Positive[float] = 25.0  # m from a node, within which the shift of the node changes to that of the edge
     boundaries: bool = True  # whether road boundaries count, where the fleet has any
-    boundary_weight: NotNegative[float] = 60.0  # votes that boundaries seen on both sides are worth
+    boundary_weight: NotNegative[float] = 60.0  # votes that boundaries seen on both sides count as
     tolerance: NotNegative[float] = 0.1  # m, by which the result is simplified
 
 
@@ -87,7 +87,7 @@ def refine_centreline(
     matches
         From `probe2road.matching.match.match`.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -173,7 +173,7 @@ class _Ways:
 def _offsets(
     driven: Traversals, fixes: FramedFixes, stations: Stations, options: CentrelineOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Offset of the middle at every station (m to the left, NaN without votes), and its votes; shape (S,) each."""
+    """Return the offset of the middle at every station (m to the left, NaN without votes) and its weight; (S,) each."""
     n, n_edges = len(stations.edge), len(stations.spacing)
     votes = _votes(driven, fixes, stations, options.max_left)
     ways = _ways(votes, n_edges, options)
@@ -191,7 +191,7 @@ def _offsets(
 
 
 def _votes(driven: Traversals, fixes: FramedFixes, stations: Stations, max_left: float) -> _Votes:
-    """Take the mean of the fixes of every drive near every station, up to a distance (m) from the edge."""
+    """Average the fixes of every drive near every station, as far as they lie within a distance (m) of the edge."""
     near = np.abs(fixes.left) <= max_left
     place = stations.nearest(driven.edge[fixes.traversal], fixes.along)
     table = pd.DataFrame({"place": place, "traversal": fixes.traversal, "left": fixes.left})[near]
@@ -201,7 +201,7 @@ def _votes(driven: Traversals, fixes: FramedFixes, stations: Stations, max_left:
 
 
 def _ways(votes: _Votes, n_edges: int, options: CentrelineOptions) -> _Ways:
-    """Tell on which edges both directions are driven, and how far from each other."""
+    """Tell which edges are driven in both directions, and how far apart the two directions are."""
     of_way = 2 * votes.edge + votes.forward
     count = np.bincount(of_way, minlength=2 * n_edges).reshape(-1, 2)
     two = count.min(axis=1) >= np.maximum(options.two_way_share * count.sum(axis=1), 3)
@@ -221,7 +221,7 @@ def _between_boundaries(
     stations: Stations,
     options: CentrelineOptions,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Offset of the middle between road boundaries at stations with both (m to the left), and its weight; (S,) each.
+    """Return the offset of the middle between both road boundaries (m to the left) and its weight; (S,) each.
 
     A boundary point belongs to the edge that the vehicle was matched to when it saw the point. The boundary of a side
     is the nearest one, which many see; what lies behind it belongs to another road.
@@ -253,7 +253,7 @@ def _between_boundaries(
 
 @dataclass(frozen=True)
 class _Shifts:
-    """What is to move, before it is known how much of it folds."""
+    """The planned shifts of stations and nodes, before it is known which of them would fold an edge."""
 
     lines: EdgeLines
     stations: Stations
@@ -263,7 +263,7 @@ class _Shifts:
     at_end: NDArray[np.float64]  # (S, 2) share of the shift that is that of the node at the start and at the end
 
     def shared(self, share: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the shifts of stations ``(S, 2)`` and nodes ``(N, 2)``, given the share ``(E,)`` for each edge.
+        """Return the shifts of stations ``(S, 2)`` and nodes ``(N, 2)``, each scaled by the share ``(E,)`` of its edge.
 
         A node takes the least share of its edges.
         """
@@ -286,7 +286,7 @@ def _moved(
     weight: NDArray[np.float64],
     options: CentrelineOptions,
 ) -> tuple[RoadGraph, NDArray[np.float64]]:
-    """Shift the stations of all edges (m to the left, shape (S,)), and nodes with them; mean shift of every edge."""
+    """Shift all stations (m to the left, shape (S,)) and the nodes with them; return the mean shift of every edge."""
     shifts = _planned(graph, lines, stations, shift, weight, options)
     edge, along, xyz = courses(lines, stations, np.ones(len(stations.edge), bool))
     was_simple = shapely.is_simple(graph.edges.geometry.to_numpy())
@@ -322,14 +322,15 @@ def _planned(
     node = graph.end_rows
     end = np.stack([stations.first[:-1], stations.first[1:] - 1], axis=1)
 
-    # What a node is to do: least squares over what its edges want across, drawn towards staying.
-    wish, pull = weight[end].ravel() / options.vote_sigma**2, 1.0 / options.prior_sigma**2
-    n, want, at = normal[end].reshape(-1, 2), shift[end].ravel(), node.ravel()
+    # Shift of a node: least squares over the shifts across its edges, with a prior of no shift.
+    vote_weight, prior_weight = weight[end].ravel() / options.vote_sigma**2, 1.0 / options.prior_sigma**2
+    end_normal, end_shift, end_node = normal[end].reshape(-1, 2), shift[end].ravel(), node.ravel()
+    end_weight = vote_weight + prior_weight
     matrix = np.zeros((len(graph.nodes), 2, 2))
     right = np.zeros((len(graph.nodes), 2))
-    np.add.at(matrix, at, (wish + pull)[:, None, None] * n[:, :, None] * n[:, None, :])
-    np.add.at(right, at, ((wish + pull) * want)[:, None] * n)
-    matrix += pull * np.eye(2)
+    np.add.at(matrix, end_node, end_weight[:, None, None] * end_normal[:, :, None] * end_normal[:, None, :])
+    np.add.at(right, end_node, (end_weight * end_shift)[:, None] * end_normal)
+    matrix += prior_weight * np.eye(2)
     of_node = np.asarray(np.linalg.solve(matrix, right[:, :, None])[:, :, 0], np.float64)
     size = np.hypot(*of_node.T)
     of_node *= np.minimum(1.0, options.max_shift / np.maximum(size, 1e-9))[:, None]
@@ -343,7 +344,7 @@ def _planned(
 def _folds(
     before: NDArray[np.float64], after: NDArray[np.float64], edge: NDArray[np.int64], was_simple: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Tell which edges run backwards somewhere, or cross themselves where they did not; shape (E,)."""
+    """Tell which edges run backwards somewhere, or cross themselves where they did not before; shape (E,)."""
     same = np.diff(edge) == 0
     old, new = np.diff(before, axis=0), np.diff(after, axis=0)
     backwards = same & ((old * new).sum(axis=1) <= 0) & ((old**2).sum(axis=1) > 0)
@@ -358,7 +359,7 @@ def _with_geometry(
     node: NDArray[np.int64],
     of_node: NDArray[np.float64],
 ) -> RoadGraph:
-    """Put vertices of edges and shifts of nodes (m, shape (N, 2)) into a graph."""
+    """Return the graph with new vertices of its edges and its nodes shifted (m, shape (N, 2))."""
     old_nodes = graph.nodes.geometry.to_numpy()
     position = shapely.get_coordinates(old_nodes, include_z=True)
     position[:, :2] += of_node

@@ -51,7 +51,7 @@ EVIDENCE_COLUMNS = (
 @dataclass(frozen=True)
 @checked
 class EvidenceOptions:
-    """What counts as having driven an edge, and how its properties are estimated."""
+    """When an edge counts as driven, and how the properties of edges are estimated."""
 
     min_cover: NotNegative[float] = 15.0  # m of an edge, or half of a shorter one, that a traversal has to cover
     drive_pause: NotNegative[float] = 300.0  # s; traces of one vehicle that follow each other sooner are one drive
@@ -80,7 +80,7 @@ def add_evidence(
     matches
         From `probe2road.matching.match.match`.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def add_evidence(
 
 
 def drive_numbers(fleet: Fleet, *, pause: float = 300.0) -> NDArray[np.int64]:
-    """Tell which traces are one drive: those of one vehicle that follow each other after at most a pause (s).
+    """Return the drive of every trace: traces of one vehicle with at most a pause (s) between them are one drive.
 
     Fleets often cut a drive into several traces. Where vehicles or times are unknown, every trace is a drive.
 
@@ -167,7 +167,7 @@ def drive_numbers(fleet: Fleet, *, pause: float = 300.0) -> NDArray[np.int64]:
 def _counts(
     graph: RoadGraph, fleet: Fleet, driven: Traversals, options: EvidenceOptions
 ) -> dict[str, pd.arrays.IntegerArray]:
-    """Count distinct traces, drives and vehicles, and traversals each way, per edge."""
+    """Count, for every edge, the distinct traces, drives and vehicles, and the traversals in each direction."""
     length = edge_lines(graph).length[driven.edge]
     enough = driven.high - driven.low >= np.minimum(options.min_cover, length / 2)
     edge, trace, forward = driven.edge[enough], driven.trace[enough], driven.forward[enough]
@@ -193,7 +193,7 @@ def _counts(
 
 
 def _oneway(edges: pd.DataFrame, options: DirectionOptions) -> dict[str, Any]:
-    """Decide the direction of every edge, in the words of OpenStreetMap; what is there already stays."""
+    """Decide the direction of every edge, in the words of OpenStreetMap; a known direction is kept."""
     direction = counted_direction(edges, options=options)
     if "oneway" in edges:
         direction = told_direction(edges["oneway"]).fillna(direction)
@@ -211,7 +211,7 @@ def _oneway(edges: pd.DataFrame, options: DirectionOptions) -> dict[str, Any]:
 def _speeds(
     graph: RoadGraph, fleet: Fleet, driven: Traversals, fixes: FramedFixes, longest: float
 ) -> NDArray[np.float64]:
-    """Metres driven by seconds spent on every edge, from fixes that follow each other on it; shape (E,), m/s.
+    """Return the mean speed on every edge (m/s), from pairs of consecutive fixes on it; shape (E,).
 
     Edges with no two such fixes take the mean of the column ``speed`` of their fixes.
     """

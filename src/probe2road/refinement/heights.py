@@ -1,4 +1,4 @@
-"""Heights of edges: the profile on which traces agree whose own heights are metres off.
+"""Heights of edges: one common profile from traces whose own heights are wrong by metres.
 
 Strategy
 --------
@@ -35,8 +35,8 @@ from probe2road.options import checked
 
 __all__ = ["HeightOptions", "with_heights"]
 
-_SIGMA_OF_MAD = 1.4826  # ratio of a normal law
-_ROUNDS = 12  # of the alternation between profile and bias; the last ones move heights by millimetres
+_SIGMA_OF_MAD = 1.4826  # standard deviation over median absolute deviation of a normal distribution
+_ROUNDS = 12  # alternations between profile and bias; the last ones change heights by millimetres
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class HeightOptions:
     """How heights are estimated."""
 
     spacing: Positive[float] = 10.0  # m between the places at which heights are estimated
-    bias_length: Positive[float] = 500.0  # m driven, over which a trace is wrong about its height by the same amount
-    bias_sigma: Positive[float] = 4.0  # m, of that amount
-    sigma: Positive[float] = 0.5  # m, of heights about it, at least; what is seen where that is more
+    bias_length: Positive[float] = 500.0  # m driven, over which the height error (bias) of a trace is constant
+    bias_sigma: Positive[float] = 4.0  # m, 1 sigma of this bias
+    sigma: Positive[float] = 0.5  # m, least 1 sigma of heights about the bias; a larger observed one is used
     reach: NotNegative[float] = 100.0  # m; shorter humps are levelled
     tolerance: NotNegative[float] = 0.15  # m, by which the profile may be simplified
     same_height: NotNegative[float] = 1.5  # m; edge ends at a node that differ by less meet at one height
@@ -61,7 +61,7 @@ def with_heights(
     *,
     options: HeightOptions | None = None,
 ) -> RoadGraph:
-    """Give edges the heights that their traces agree on, and the column ``height_spread``.
+    """Give edges the height profile on which their traces agree, and add the column ``height_spread``.
 
     Edges that nobody with a height drove keep what they have. The course in plan stays the same.
 
@@ -72,7 +72,7 @@ def with_heights(
     driven, fixes
         From `probe2road.matching.frame.frame`.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -114,7 +114,7 @@ def with_heights(
 
 
 def _stretches(fleet: Fleet, row: NDArray[np.int64], trace: NDArray[np.int64], longest: float) -> NDArray[np.int64]:
-    """Cut traces into stretches of so many metres, over which the bias of the height is one number."""
+    """Cut traces into stretches of a given length (m); the height error of a trace is constant on each stretch."""
     xy = fleet.traces[["x", "y"]].to_numpy(np.float64)
     step = np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)
     step[fleet.starts[:-1]] = 0.0
@@ -131,38 +131,41 @@ def _heights_without_bias(
     n_places: int,
     options: HeightOptions,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Separate what places are high from what stretches of traces are wrong about it.
+    """Estimate the height of every place and the constant height error of every stretch of a trace.
 
     Alternates between the two; each is a mean in which outliers count less (Cauchy's weights), and the bias is drawn
     towards zero, which fixes the level of the whole. Returns heights ``(n_places,)``, what is left over of every fix,
     and the weight of each place: how many stretches passed it, down-weighted where they disagree.
     """
     cells = pd.DataFrame({"place": place, "stretch": stretch, "z": z}).groupby(["place", "stretch"])["z"].median()
-    at, of, value = (cells.index.codes[0].astype(np.int64), cells.index.codes[1].astype(np.int64), cells.to_numpy())
-    at, of = cells.index.levels[0].to_numpy()[at], cells.index.levels[1].to_numpy()[of]
+    place_of = cells.index.levels[0].to_numpy()[cells.index.codes[0].astype(np.int64)]
+    stretch_of = cells.index.levels[1].to_numpy()[cells.index.codes[1].astype(np.int64)]
+    value = cells.to_numpy()
     n_stretches = int(stretch.max()) + 1
-    middle = pd.Series(value).groupby(at).median()
+    middle = pd.Series(value).groupby(place_of).median()
     height, bias, weight = np.full(n_places, np.nan), np.zeros(n_stretches), np.ones(len(value))
     height[middle.index.to_numpy()] = middle.to_numpy()
     sigma = options.sigma
     for _ in range(_ROUNDS):
-        away = value - height[at]
+        away = value - height[place_of]
         pull = (sigma / options.bias_sigma) ** 2
-        bias = np.bincount(of, weight * away, n_stretches) / (np.bincount(of, weight, n_stretches) + pull)
-        total = np.bincount(at, weight, n_places)
-        sums = np.bincount(at, weight * (value - bias[of]), n_places)
+        bias = np.bincount(stretch_of, weight * away, n_stretches) / (
+            np.bincount(stretch_of, weight, n_stretches) + pull
+        )
+        total = np.bincount(place_of, weight, n_places)
+        sums = np.bincount(place_of, weight * (value - bias[stretch_of]), n_places)
         height = np.divide(sums, total, out=np.full(n_places, np.nan), where=total > 0)
-        off = value - bias[of] - height[at]
+        off = value - bias[stretch_of] - height[place_of]
         sigma = max(options.sigma, _SIGMA_OF_MAD * float(np.median(np.abs(off))))
         weight = 1.0 / (1.0 + (off / (3.0 * sigma)) ** 2)
     left_over: NDArray[np.float64] = z - bias[stretch] - height[place]
-    return height, left_over, np.bincount(at, weight, n_places).astype(np.float64)
+    return height, left_over, np.bincount(place_of, weight, n_places).astype(np.float64)
 
 
 def _joined_at_nodes(
     graph: RoadGraph, stations: Stations, profile: NDArray[np.float64], has: NDArray[np.bool_], tolerance: float
 ) -> NDArray[np.float64]:
-    """Let edges that end at a node within a tolerance (m) of each other end at the same height."""
+    """Make edges meet at one height at a node if their heights there differ by less than a tolerance (m)."""
     end = np.stack([stations.first[:-1], stations.first[1:] - 1], axis=1).ravel()
     ends = pd.DataFrame({"node": graph.edges[["u", "v"]].to_numpy().ravel(), "z": profile[end]})[np.repeat(has, 2)]
     of_node = ends.groupby("node")["z"]
@@ -178,7 +181,7 @@ def _joined_at_nodes(
 def _profiled(
     graph: RoadGraph, stations: Stations, profile: NDArray[np.float64], has: NDArray[np.bool_], tolerance: float
 ) -> NDArray[Any]:
-    """Put heights into the lines of edges; stations become vertices where the profile needs them."""
+    """Write heights into the lines of edges; stations become vertices where the profile needs them."""
     lines = edge_lines(graph)
     needed = has[stations.edge] & stations.bends(profile, tolerance)
     edge, along, xyz = courses(lines, stations, needed)

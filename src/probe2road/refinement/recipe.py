@@ -1,4 +1,4 @@
-"""Centreline refinement with the fleet's own drives: what the mask cannot say, the traces can.
+"""Refinement of a graph with the fleet's own drives: traces show what the mask cannot.
 
 A raster knows neither whether two ends of roads with a gap between them are one road, nor whether two roads
 that cross also meet, nor where a ramp leaves its road. Traces are matched to the graph again and again: to tell which
@@ -41,24 +41,25 @@ logger = logging.getLogger(__name__)
 class RefineOptions:
     """How traces refine a graph."""
 
-    min_traces: NotNegative[int] = 4  # traces that must drive through a filled gap for it to stay
-    gap_weight: Annotated[float, Above(0), AtMost(1)] = 0.1  # of turning into a gap edge; 1 for other edges
+    min_traces: NotNegative[int] = 4  # traces that must drive through a filled gap, or it is removed
+    gap_weight: Annotated[float, Above(0), AtMost(1)] = 0.1  # weight of turning into a gap edge; other edges have 1
     gaps: GapOptions = field(default_factory=GapOptions)  # which gaps are filled
     matching: MatchOptions = field(default_factory=MatchOptions)  # how traces are matched
-    min_support: NotNegative[int] | None = None  # traces on an edge that let it stay; 0 keeps all, None is as for move
+    min_support: NotNegative[int] | None = None  # fewest traces on an edge; 0 keeps all; None: see `settled`
     rungs: RungOptions = field(default_factory=RungOptions)  # which edges need more than min_support
     junctions: DisambiguateOptions = field(default_factory=DisambiguateOptions)  # which junctions are split
     braids: BraidOptions = field(default_factory=BraidOptions)  # which chains of edges are roads side by side
     forks: ForkOptions = field(default_factory=ForkOptions)  # which forks are moved to where traces part
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)  # what counts as having driven an edge
     move: bool | None = None  # whether edges move to the middle of what was driven; None: see `settled`
-    centreline: CentrelineOptions = field(default_factory=CentrelineOptions)  # how far they may
+    centreline: CentrelineOptions = field(default_factory=CentrelineOptions)  # how far edges move
 
     def settled(self, *, learned: bool) -> RefineOptions:
-        """Settle what is None by where the lines of the graph come from.
+        """Replace options that are None by defaults for learned or unlearned segmentation.
 
-        A network has learned where the middle of a road is, and what it adds to the roads are rungs and fragments that
-        nobody drives on. The lines of density lie where the traces do, and where these are few none may be matched.
+        A network has learned where the middle of a road is, so edges are not moved; its false lines are rungs and
+        fragments without drives, which are removed. The lines from density lie where the traces are; where these are
+        few, it may happen that none is matched, so edges without a match are kept.
         """
         return replace(
             self,
@@ -69,7 +70,7 @@ class RefineOptions:
 
 @dataclass(frozen=True)
 class _Stand:
-    """What a step has to work with: the graph as it stands, and the fleet's matches to it."""
+    """The input of a step: the current graph, and the fleet's matches to it."""
 
     graph: RoadGraph
     fleet: Fleet
@@ -85,17 +86,17 @@ class _Step:
     Attributes
     ----------
     name
-        For the log.
+        Name of the step in the log.
     apply
         Returns another graph, or the same object where there was nothing to do.
     proposed
-        Whether the graph holds links that are only proposed: traces then drive through them reluctantly.
+        Whether the graph holds links that are only proposed: driving through them then costs more.
     follows
-        Whether it is left out where the step before changed nothing.
+        Whether the step is left out if the step before changed nothing.
     keeps_roads
         Whether edges and nodes stay the same, so that the matches stay valid.
     stage
-        Under which the graph is kept after it.
+        Stage of the workspace under which the graph is kept after this step.
     """
 
     name: str
@@ -180,9 +181,9 @@ def refine(
         The fleet, in the graph's CRS.
     learned
         Whether the lines come from a network that has learned where the middle of a road is, or from the density of
-        traces. It settles what is None in the options; see `RefineOptions.settled`.
+        traces. It decides the value of options that are None; see `RefineOptions.settled`.
     options
-        The defaults where it is None.
+        None takes the defaults.
     clean
         How the graph is cleaned once its gaps are filled.
     keep
@@ -241,6 +242,6 @@ def refine(
 
 
 def _matched(graph: RoadGraph, fleet: Fleet, options: RefineOptions, *, proposed: bool) -> Matches:
-    """Match the fleet; links that are only proposed are driven reluctantly."""
+    """Match the fleet; the cost of links that are only proposed is higher."""
     weights = gap_weights(graph, gap=options.gap_weight) if proposed else None
     return match(graph, fleet, options=options.matching, edge_weights=weights)

@@ -1,4 +1,4 @@
-"""Edges that too few traces drove on: lines that are no road, and rungs between roads beside each other."""
+"""Edges that too few traces drove on: lines that are no roads, and rungs between parallel roads."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ __all__ = ["RungOptions", "drop_undriven", "traces_per_edge"]
 @dataclass(frozen=True)
 @checked
 class RungOptions:
-    """Which edges are rungs: short ones between two junctions, on which only errors of the matching put traces."""
+    """Which edges are rungs: short edges between two junctions, driven only in the errors of the map matching."""
 
     max_length: NotNegative[float] = 60.0  # m; longer edges are roads; 0 takes none for a rung
-    min_traces: NotNegative[int] = 4  # traces that make a road of it
-    min_share: NotNegative[float] = 0.3  # of the traces that pass at its quieter end, which make a road of it, too
+    min_traces: NotNegative[int] = 4  # an edge with as many traces is a road
+    min_share: NotNegative[float] = 0.3  # an edge with this share of the traces at its quieter end is a road, too
 
 
 def drop_undriven(
@@ -45,7 +45,7 @@ def drop_undriven(
     min_traces
         Distinct traces that must be matched to an edge; 0 keeps all.
     rungs
-        Which edges need more than that; none where it is None.
+        Which edges need more than that; none if it is None.
 
     Returns
     -------
@@ -81,7 +81,7 @@ def drop_undriven(
 
 
 def traces_per_edge(graph: RoadGraph, steps: pd.DataFrame) -> NDArray[np.int64]:
-    """Count the distinct traces with a step on each edge, shape (E,)."""
+    """Count the distinct traces that have a step on each edge, shape (E,)."""
     traces = steps.groupby("edge")["trace_id"].nunique()
     return traces.reindex(graph.edges.index, fill_value=0).to_numpy(np.int64)
 

@@ -1,4 +1,4 @@
-"""Long work: what its stages leave behind, how far it is, and processes that share it."""
+"""Long work: stages and their stored results, progress, and processes that share the work."""
 
 from pkgutil import iter_modules
 

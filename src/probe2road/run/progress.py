@@ -1,4 +1,4 @@
-"""How far long work is: the callback that is told, and a bar on the terminal for each stage."""
+"""Progress of long work: the callback that reports it, and a bar on the terminal for each stage."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Progress = Callable[[str, int, int], None]
 
 
 def silent(stage: str, done: int, total: int) -> None:
-    """Report nothing: the progress of a run that nobody follows."""
+    """Report nothing, for runs whose progress is not shown."""
 
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Show how far the current stage is, on standard error and only on a terminal."""
+    """Show the progress of the current stage, on standard error and only on a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar

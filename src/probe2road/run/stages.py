@@ -1,4 +1,4 @@
-"""The stages of long work: the only place that names their files.
+"""The stages of long work, and the names of their files.
 
 A stage is a step whose result is kept, in a file of the workspace. Its number says where in the pipeline it stands; the
 baselines share the numbers, so that equal things have equal names.
@@ -32,7 +32,7 @@ RASTER, GRAPH, RECORD, ARRAYS = ".tif", ".gpkg", ".json", ".npz"
 
 @dataclass(frozen=True)
 class Stage:
-    """A step of long work, and the kind of file that keeps its result.
+    """A stage of long work, and the kind of file that stores its result.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Stage:
     in_parts: bool = False
 
     def file(self, part: str = "") -> str:
-        """Return the name of the file, of one part where the stage has parts.
+        """Return the name of the file of the stage, or of one part of it if it has parts.
 
         Examples
         --------
@@ -84,7 +84,7 @@ STAGES = (
 
 
 def stage_of(file: str) -> Stage | None:
-    """Return the stage that writes files of this name, or None where none does.
+    """Return the stage that writes files of a name, or None for no stage.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Work spread over processes, its results in order."""
+"""Work in several processes, with results in order."""
 
 from __future__ import annotations
 

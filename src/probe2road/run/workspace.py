@@ -1,4 +1,4 @@
-"""What the stages of one run leave behind, so that the next run can go on from there.
+"""The stored results of the stages of a run, from which the next run can continue.
 
 A workspace is a folder with a mark of its own and the files of `probe2road.run.stages`; no other file in it is ever
 touched. Files are written atomically, so whatever is there is complete, and each names the fingerprint of the fleet,
@@ -46,20 +46,20 @@ __all__ = ["Workspace", "copy_segmentation", "fingerprint", "open_workspace", "r
 logger = logging.getLogger(__name__)
 
 _MARK, _LOCK = "workspace.json", "workspace.lock"
-_RUN = "probe2road_run"  # under which a file names the fingerprint of its run
-_FORMAT = 4  # raised when what a stage writes changes
+_RUN = "probe2road_run"  # name of the tag with the fingerprint of a run in its files
+_FORMAT = 4  # increased when the content of the files changes
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """A folder for the files of stages; with no folder, nothing is kept and nothing is found.
+    """A folder for the files of stages; without a folder, nothing is stored and nothing is found.
 
     Attributes
     ----------
     folder
-        Where the files are, or None.
+        Folder of the files, or None.
     run, segmentation
-        Fingerprints of the run, and of what its probability depends on.
+        Fingerprints of all inputs of the run, and of those that its probability depends on.
     lock
         Held while the workspace is open.
 
@@ -77,24 +77,24 @@ class Workspace:
     lock: FileLock | None = None
 
     def __enter__(self) -> Self:
-        """Return the workspace; it is open already."""
+        """Return the workspace, which is open already."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Let other runs have the folder."""
+        """Unlock the folder for other runs."""
         if self.lock is not None:
             self.lock.release()
 
     def write_raster(self, stage: Stage, array: NDArray[Any] | Blocks, grid: Grid) -> None:
-        """Keep a raster."""
+        """Store a raster."""
         if self.folder is not None:
             tags = {_RUN: self._fingerprint(stage)}
             write_raster(self.folder / stage.file(), array, grid, names=[stage.name], tags=tags)
 
     def read_raster(self, stage: Stage, grid: Grid) -> Blocks | None:
-        """Return the one band of a raster that an earlier run kept on this grid, or None."""
+        """Return the single band of a raster that an earlier run stored on this grid, or None."""
         path = self._kept(stage)
         if path is None or read_tag(path, _RUN) != self._fingerprint(stage):
             return None
@@ -105,12 +105,12 @@ class Workspace:
         return blocks
 
     def write_graph(self, stage: Stage, graph: RoadGraph) -> None:
-        """Keep a graph."""
+        """Store a graph."""
         if self.folder is not None:
             write_geopackage(graph, self.folder / stage.file(), note={_RUN: self._fingerprint(stage)})
 
     def read_graph(self, stage: Stage) -> RoadGraph | None:
-        """Return a graph that an earlier run kept, or None."""
+        """Return a graph that an earlier run stored, or None."""
         path = self._kept(stage)
         if path is None or read_note(path, _RUN) != self._fingerprint(stage):
             return None
@@ -118,19 +118,19 @@ class Workspace:
         return read_graph(path)
 
     def finish(self, stage: Stage, graph: RoadGraph) -> RoadGraph:
-        """Keep the result of a run and return it as a run that goes on from it would: equal to the last byte."""
+        """Store the result of a run, and return it as a continued run would return it: equal to the last byte."""
         self.write_graph(stage, graph)
         return graph if self.folder is None else read_graph(self.folder / stage.file())
 
     def write_arrays(self, stage: Stage, part: str, **arrays: NDArray[Any]) -> None:
-        """Keep arrays of one part, compressed: what is kept on the way is many times what is kept at the end."""
+        """Store arrays of one part, compressed, because intermediate results are many times larger than final ones."""
         if self.folder is not None:
             with atomic_path(self.folder / stage.file(part)) as temporary:
                 named: dict[str, Any] = {_RUN: np.array(self._fingerprint(stage)), **arrays}
                 np.savez_compressed(temporary, **named)
 
     def read_arrays(self, stage: Stage, part: str) -> dict[str, NDArray[Any]] | None:
-        """Return the arrays of one part that an earlier run kept, or None."""
+        """Return the arrays of one part that an earlier run stored, or None."""
         path = self._kept(stage, part)
         if path is None:
             return None
@@ -139,26 +139,26 @@ class Workspace:
         return arrays if str(arrays.pop(_RUN, "")) == self._fingerprint(stage) else None
 
     def drop(self, stage: Stage) -> None:
-        """Remove the files of a stage, once a later one holds what is in them."""
+        """Remove the files of a stage, once a later stage has stored what they contain."""
         if self.folder is not None:
             for path in self.folder.iterdir():
                 if stage_of(path.name) is stage:
                     path.unlink()
 
     def write_record(self, stage: Stage, record: Mapping[str, Any]) -> None:
-        """Keep what a stage was configured with."""
+        """Store the configuration of a stage."""
         if self.folder is not None:
             with atomic_path(self.folder / stage.file()) as temporary:
                 temporary.write_text(json.dumps({_RUN: self._fingerprint(stage), **record}, indent=1))
 
     def read_record(self, stage: Stage) -> dict[str, Any] | None:
-        """Return a record that an earlier run kept, or None."""
+        """Return a record that an earlier run stored, or None."""
         path = self._kept(stage)
         record = {} if path is None else dict(json.loads(path.read_text()))
         return record if record.pop(_RUN, None) == self._fingerprint(stage) else None
 
     def _kept(self, stage: Stage, part: str = "") -> Path | None:
-        """Return the file of a stage, or None where there is none."""
+        """Return the stored file of a stage, or None."""
         path = None if self.folder is None else self.folder / stage.file(part)
         return path if path is not None and path.exists() else None
 
@@ -174,7 +174,7 @@ def open_workspace(
     weights: str | None = None,
     segmentation: DataclassInstance | None = None,
 ) -> Workspace:
-    """Open the workspace of a run; close it by leaving its ``with`` block.
+    """Open the workspace of a run; it is closed at the end of the ``with`` block.
 
     Files of stages that belong to another fleet, other options or other weights are removed; so is what killed
     processes left behind. Everything else in the folder stays as it is.
@@ -229,7 +229,7 @@ def open_workspace(
 
 
 def _require_ours(folder: Path) -> None:
-    """Refuse a folder that holds anything but is no workspace."""
+    """Refuse a folder that is not empty and not a workspace."""
     if _read_mark(folder) is not None:
         return
     foreign = sorted(path.name for path in folder.iterdir() if path.name != _LOCK and not _is_leftover(path))
@@ -239,7 +239,7 @@ def _require_ours(folder: Path) -> None:
 
 
 def _read_mark(folder: Path) -> dict[str, Any] | None:
-    """Return what the mark of a workspace says, or None where the folder has none."""
+    """Return the content of the mark file of a workspace, or None if the folder has none."""
     try:
         mark = json.loads((folder / _MARK).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -248,7 +248,7 @@ def _read_mark(folder: Path) -> dict[str, Any] | None:
 
 
 def _is_leftover(path: Path) -> bool:
-    """Whether a run that was killed left this behind: a hidden folder of ours, or one with nothing in it."""
+    """Tell whether a path is left over from a killed run: a hidden folder of ours, or one with nothing in it."""
     return path.name.startswith(".") and path.is_dir() and (is_workshop(path) or not any(path.iterdir()))
 
 
@@ -269,7 +269,7 @@ def _locked(folder: Path) -> FileLock:
 
 @contextmanager
 def resumable(output: str | Path) -> Iterator[Path]:
-    """Give long work a hidden workspace beside its output, which is removed when the block ends without an error.
+    """Give long work a hidden workspace beside its output, which is removed if the block ends without an error.
 
     An error or a kill leaves the workspace, so that the same call goes on from there.
 
@@ -309,7 +309,7 @@ def resumable(output: str | Path) -> Iterator[Path]:
 
 
 def copy_segmentation(folder: Path, target: Path) -> None:
-    """Start a workspace with the probability of another, for a run that differs only in options of later stages.
+    """Start a workspace with the probability of another one, for a run that differs only in options of later stages.
 
     Parameters
     ----------
@@ -327,7 +327,7 @@ def copy_segmentation(folder: Path, target: Path) -> None:
 
 
 def fingerprint(fleet: Fleet) -> str:
-    """Return a digest of everything in a fleet, which equal fleets share.
+    """Return a digest of all data of a fleet; equal fleets have equal digests.
 
     Examples
     --------
@@ -346,5 +346,5 @@ def fingerprint(fleet: Fleet) -> str:
 
 
 def _digest(record: Mapping[str, Any]) -> str:
-    """Return a digest of what decides a run."""
+    """Return a digest of the inputs that determine a run."""
     return hashlib.blake2b(json.dumps(record, default=str).encode(), digest_size=16).hexdigest()

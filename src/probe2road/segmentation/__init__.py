@@ -1,4 +1,4 @@
-"""Counts in, centreline probability out: segmenters behind one interface."""
+"""Segmentation: from counts to centreline probability, by segmenters with a common interface."""
 
 from pkgutil import iter_modules
 

@@ -1,4 +1,4 @@
-"""Self-attention over the places of a feature map: the variants that the paper tried and rejected.
+"""Self-attention over the positions of a feature map: the variants that the paper tried and rejected.
 
 Both know where a place is from sines and cosines of its row and column, so that they take maps of any size.
 """
@@ -20,7 +20,7 @@ _LONGEST_WAVE = 256.0  # places; longer than any map
 
 
 class SpatialAttention(nn.Module):
-    """Multi-head self-attention in the place of a 3x3 convolution.
+    """Multi-head self-attention that replaces a 3x3 convolution.
 
     Notes
     -----
@@ -50,7 +50,7 @@ class SpatialAttention(nn.Module):
 
 
 class AttentionCentre(nn.Module):
-    """A vision transformer in the place of the dilated convolutions: every place of the centre map is a token.
+    """A vision transformer that replaces the dilated convolutions; every position of the centre map is a token.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""How far the traces of one road lie apart, and the kernel bandwidth that follows from it.
+"""The kernel bandwidth of the density segmenter, from the lateral distances of the traces of one road.
 
 Strategy
 --------
@@ -30,18 +30,18 @@ _STANDING = 1.0  # m; shorter steps have no direction
 _REACH = 20.0  # m, lateral distance looked at
 _ALONG = 5.0  # m, longitudinal distance looked at
 _HOLE = 5.0  # m without traces end a road
-_MIN_PIECES = 10  # that a place must have to count
-_PLACES = 4000  # at most, those with the most traffic
-_TURN = np.cos(np.radians(20.0))  # pieces that run along or against a place differ by less
+_MIN_PIECES = 10  # fewest pieces of a place that counts
+_PLACES = 4000  # largest number of places, those with the most traffic
+_TURN = np.cos(np.radians(20.0))  # pieces with or against the direction of a place differ by less
 _CELL = _REACH + _ALONG  # m; neighbours of a piece are in its cell or the eight around it
 
-_FACTOR = 2.3  # bandwidth over spread: wide enough that a road is one ridge
+_FACTOR = 2.3  # bandwidth over spread: wide enough for a road to be one ridge
 _RANGE = (3.0, 15.0)  # m
 _STEP = 0.5  # m; the bandwidth is rounded, so that small changes of the data do not change it
 
 
 def estimate_bandwidth(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> float:
-    """Return the kernel bandwidth (m) at which the traces of one road blur into one ridge.
+    """Return the kernel bandwidth (m) at which the traces of one road form one ridge.
 
     2.3 times the lateral spread of the traces, between 3 m and 15 m, in steps of half a metre; 5 m where no
     place has enough traces to tell.
@@ -65,7 +65,7 @@ def estimate_bandwidth(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = Non
 
 
 def lateral_spread(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> float:
-    """Return the median standard deviation (m) of the traces across a road, NaN where there are too few.
+    """Return the median standard deviation (m) of the traces across a road; NaN if there are too few traces.
 
     Examples
     --------
@@ -102,7 +102,7 @@ def lateral_spread(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -
 
 
 def _pieces(fleet: Fleet, breaks: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Cut the moving segments into equal pieces: their middles ``(n, 2)`` and unit directions ``(n, 2)``."""
+    """Cut the segments of moving vehicles into equal pieces: midpoints ``(n, 2)`` and unit directions ``(n, 2)``."""
     fixes = fleet.traces[["x", "y"]].to_numpy()
     end = np.flatnonzero(~breaks)
     step = fixes[end] - fixes[end - 1]
@@ -122,7 +122,7 @@ def _spreads(
     columns: int,
     places: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Return the standard deviation across each place, NaN with too few pieces; pieces are sorted by cell."""
+    """Return the standard deviation of traces across each place; NaN with too few pieces. Pieces are sorted by cell."""
     result = np.full(len(places), np.nan)
     for number in range(len(places)):
         here = places[number]

@@ -1,4 +1,4 @@
-"""Where a predicted mask breaks the connectivity of its reference, and how near every pixel is to such a place.
+"""Places where a predicted mask breaks the connectivity of its reference, and every pixel's nearness to them.
 
 Strategy
 --------
@@ -35,7 +35,7 @@ Buffer = Literal["2x2", "3x3"]
 
 @dataclass(frozen=True)
 class WrongSkeletons:
-    """Where the skeletons of a prediction and a reference contradict each other.
+    """The parts of the skeletons of a prediction and a reference that contradict each other.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class WrongSkeletons:
 
 
 def dilate(mask: NDArray[np.bool_], buffer: Buffer) -> NDArray[np.bool_]:
-    """Dilate a mask by the element of the buffer; what would leave the array is lost.
+    """Dilate a mask by the structuring element of the buffer; pixels beyond the array are lost.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def dilate(mask: NDArray[np.bool_], buffer: Buffer) -> NDArray[np.bool_]:
 def wrong_skeletons(
     prediction: NDArray[Any], reference: NDArray[Any], *, buffer: Buffer = "2x2", thinning: Method = "zhang_suen"
 ) -> WrongSkeletons:
-    """Find the missed parts of a reference's skeleton and the ghosts of a prediction's.
+    """Find the missed parts of a reference's skeleton, and the ghosts: wrong parts of a prediction's skeleton.
 
     Both masks are thinned, so that a reference may be a line of any width. Where one of them is empty, the whole
     skeleton of the other is wrong.
@@ -265,7 +265,7 @@ def connectivity_weights(
 
 @njit(cache=True, nogil=True)
 def _distances_along_columns(mask: NDArray[np.bool_], far: int) -> NDArray[np.int32]:
-    """Return the distance to the nearest set pixel of the same column, at least ``far`` where there is none."""
+    """Return the distance to the nearest set pixel of the same column; at least ``far`` if there is none."""
     rows, cols = mask.shape
     gap = np.empty((rows, cols), np.int32)
     for col in range(cols):
@@ -281,7 +281,7 @@ def _distances_along_columns(mask: NDArray[np.bool_], far: int) -> NDArray[np.in
 
 @njit(cache=True, nogil=True)
 def _distances_along_rows(gap: NDArray[np.int32], far: int) -> NDArray[np.float32]:
-    """Return the distance to the nearest set pixel from those along columns; at least one column has a pixel."""
+    """Return the distance to the nearest set pixel, given the distances along columns; one pixel must be set."""
     rows, cols = gap.shape
     distance = np.empty((rows, cols), np.float32)
     site, height = np.empty(cols, np.int64), np.empty(cols, np.int64)  # vertices of the hull, left to right

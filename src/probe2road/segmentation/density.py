@@ -1,4 +1,4 @@
-"""Centreline probability from trace density alone: needs no weights and no camera.
+"""Centreline probability from trace density alone, without network weights and without a camera.
 
 Strategy
 --------
@@ -41,28 +41,28 @@ __all__ = ["DensityOptions", "density_probability", "density_segmenter"]
 
 logger = logging.getLogger(__name__)
 
-_TRUNCATE = 4.5  # kernel half-width, bandwidths; a shorter one ends in a step that curves like a ridge
+_TRUNCATE = 4.5  # kernel half-width in bandwidths; a shorter kernel ends in a step that looks like a ridge
 _CLOSE_BY = 1 / 3  # bandwidths
 _THRESHOLD = 0.5  # probability that continues a road
-_SEED_THRESHOLD = 0.67  # probability that starts one: three traces on a ridge
+_SEED_THRESHOLD = 0.67  # probability that starts a road: three traces on a ridge
 _WINDOW = 1024  # pixels; no influence on the result
 
 
 @dataclass(frozen=True)
 @checked
 class DensityOptions:
-    """How density becomes probability."""
+    """How trace density is converted to probability."""
 
-    bandwidth: Positive[float] | None = None  # m, Gaussian sigma; estimated from the data where None
+    bandwidth: Positive[float] | None = None  # m, Gaussian sigma; None: estimated from the data
     half_evidence: Positive[float] = 1.0  # traces on a ridge at which the probability is one half
-    half_presence: Positive[float] = 0.3  # traces close by at which it is one half
-    half_ridge: Positive[float] = 0.3  # relative curvature at which it is one half
+    half_presence: Positive[float] = 0.3  # traces close by at which the probability is one half
+    half_ridge: Positive[float] = 0.3  # relative curvature at which the probability is one half
 
 
 def density_segmenter(
     fleet: Fleet, grid: Grid, *, options: DensityOptions | None = None, gaps: TraceGaps | None = None
 ) -> Segmenter:
-    """Return the density segmenter for a fleet, its bandwidth settled.
+    """Return the density segmenter for a fleet, with its bandwidth estimated if it is not given.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def density_segmenter(
 def density_probability(
     trace_counts: NDArray[np.uint32], grid: Grid, *, options: DensityOptions
 ) -> NDArray[np.float32]:
-    """Return the probability that pixels lie on a centreline, from the trace channel.
+    """Return the probability that pixels lie on a centreline, computed from the trace channel.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def density_probability(
     sigma = options.bandwidth / grid.resolution
     weight = np.log2(1.0 + trace_counts).astype(np.float32)
     evidence, presence = (
-        # On the scale of traces: a single straight one has 1 on its line.
+        # The scale is that of traces: a single straight trace has 1 on its line.
         ndimage.gaussian_filter(weight * np.float32(s * np.sqrt(2 * np.pi)), s, mode="constant", truncate=_TRUNCATE)
         for s in (sigma, sigma * _CLOSE_BY)
     )
@@ -149,7 +149,7 @@ def density_probability(
 
 
 def _halo(bandwidth: float, grid: Grid) -> int:
-    """Context of a pixel: the kernel's half-width as scipy rounds it, and one pixel for the Hessian."""
+    """Return the context that a pixel needs: half the kernel, as scipy rounds it, and one pixel for the Hessian."""
     return int(_TRUNCATE * bandwidth / grid.resolution + 0.5) + 1
 
 
@@ -162,7 +162,7 @@ def _least(
     half_presence: float,
     half_ridge: float,
 ) -> NDArray[np.float32]:
-    """Probability ``(rows, cols)``: the least of evidence, presence and ridge; the outermost pixels stay 0."""
+    """Return the probability ``(rows, cols)``: the least of evidence, presence and ridge; 0 at the outer pixels."""
     rows, cols = evidence.shape
     probability = np.zeros((rows, cols), np.float32)
     for r in range(1, rows - 1):

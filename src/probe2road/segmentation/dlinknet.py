@@ -1,4 +1,4 @@
-"""D-LinkNet: a residual encoder, a centre of dilated convolutions, a light decoder with additive skips.
+"""D-LinkNet: a residual encoder, a centre of dilated convolutions, and a light decoder with additive skips.
 
 Letters of the shape comments: n images, c channels, h and w pixels; F0 to F3 channels of the four encoder stages,
 at strides 4, 8, 16 and 32.
@@ -23,38 +23,38 @@ from probe2road.segmentation.attention import AttentionCentre, SpatialAttention
 
 __all__ = ["ARCHITECTURES", "STRIDE", "Architecture", "DLinkNet", "find_architecture"]
 
-STRIDE = 32  # pixels of the input that one pixel of the centre stands for
+STRIDE = 32  # pixels of the input for one pixel of the centre
 
 
 @dataclass(frozen=True)
 @checked
 class Architecture:
-    """What a network of the family looks like."""
+    """The sizes and variants of a network of the D-LinkNet family."""
 
     blocks: tuple[Positive[int], Positive[int], Positive[int], Positive[int]] = (3, 4, 6, 3)  # residual blocks a stage
     width: Annotated[int, AtLeast(8)] = 64  # channels of the stem, and of the first stage before expansion
     bottleneck: bool = False  # blocks of ResNet-50 (1x1, 3x3, 1x1 to four times the channels) instead of two 3x3
     dilations: tuple[Positive[int], ...] = (1, 2, 4, 8)  # of the convolutions of the centre
-    centre_width: Positive[int] | None = None  # channels of these convolutions; those of the encoder where None
+    centre_width: Positive[int] | None = None  # channels of these convolutions; None: those of the encoder
     head_width: Positive[int] = 32  # channels at full resolution
     centre: Literal["dilated", "transformer"] = "dilated"  # convolutions, or self-attention over all places
     attention: bool = False  # whether self-attention replaces the 3x3 convolutions of the last stage
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be built."""
+        """Refuse sizes that no network can have."""
         if self.width % 8:
             raise OptionError(f"width is {self.width}", where="Architecture", fix="use a multiple of 8")
 
     @property
     def features(self) -> tuple[int, int, int, int]:
-        """Channels F0 to F3 of the encoder stages."""
+        """Return the channels F0 to F3 of the encoder stages."""
         first = self.width * (_Bottleneck.expansion if self.bottleneck else 1)
         return first, 2 * first, 4 * first, 8 * first
 
 
 _FIVE = (1, 2, 4, 8, 16)
 
-# The published networks, the compact one for CPU users, and what the paper tried and rejected.
+# The published networks, the compact one for CPU users, and the variants that the paper tried and rejected.
 ARCHITECTURES: Mapping[str, Architecture] = {
     "dlinknet34": Architecture(),
     "dlinknet50": Architecture(bottleneck=True, dilations=_FIVE),
@@ -84,7 +84,7 @@ def find_architecture(name: str) -> Architecture:
 
 
 class DLinkNet(nn.Module):
-    """Count rasters to centreline logits.
+    """A network from count rasters to centreline logits.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ class DLinkNet(nn.Module):
 
 
 class _Basic(nn.Module):
-    """Two 3x3 convolutions beside a shortcut (ResNet-18 and -34)."""
+    """A residual block of two 3x3 convolutions with a shortcut (ResNet-18 and -34)."""
 
     expansion = 1
 
@@ -182,7 +182,7 @@ class _Basic(nn.Module):
 
 
 class _Bottleneck(nn.Module):
-    """1x1, 3x3 and 1x1 convolutions beside a shortcut (ResNet-50 and -101)."""
+    """A residual block of 1x1, 3x3 and 1x1 convolutions with a shortcut (ResNet-50 and -101)."""
 
     expansion = 4
 
@@ -209,7 +209,7 @@ class _Bottleneck(nn.Module):
 
 
 class _DilatedCentre(nn.Module):
-    """Cascaded dilated convolutions, the outputs of all stages summed with the input."""
+    """A cascade of dilated convolutions; the outputs of all stages are added to the input."""
 
     def __init__(self, channels: int, width: int | None, dilations: tuple[int, ...]) -> None:
         super().__init__()
@@ -230,7 +230,7 @@ class _DilatedCentre(nn.Module):
 
 
 class _Decoder(nn.Module):
-    """Twice the resolution, through a quarter of the channels."""
+    """A decoder block that doubles the resolution, through a quarter of the channels."""
 
     def __init__(self, before: int, after: int) -> None:
         super().__init__()
@@ -264,14 +264,14 @@ def _stage(architecture: Architecture, number: int, before: int, *, stride: int)
 
 
 def _shortcut(before: int, after: int, stride: int) -> nn.Module:
-    """Pass the input on, in the shape of the output."""
+    """Return the layers that bring the input of a block to the shape of its output."""
     if stride == 1 and before == after:
         return nn.Identity()
     return nn.Sequential(nn.Conv2d(before, after, 1, stride=stride, bias=False), nn.BatchNorm2d(after))
 
 
 def _initialise(module: nn.Module) -> None:
-    """Kaiming weights for convolutions; biases start at zero."""
+    """Initialise the weights of convolutions by Kaiming's method, and biases with zero."""
     if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
         nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
         if module.bias is not None:

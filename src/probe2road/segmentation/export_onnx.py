@@ -1,4 +1,4 @@
-"""Between training and prediction: a torch network to a weights file, and back.
+"""Export and import: from a torch network to a weights file, and back.
 
 Strategy
 --------
@@ -47,7 +47,7 @@ _UNUSED = "num_batches_tracked"  # of batch normalisation: counted in training, 
 
 
 class _Probability(nn.Module):
-    """A network whose output is probability instead of logits."""
+    """A network that returns probabilities instead of logits."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
@@ -141,7 +141,7 @@ def load_parameters(network: nn.Module, path: str | Path) -> ModelInfo:
 
 
 def _graph(model: nn.Module, info: ModelInfo) -> ModelProto:
-    """Return the ONNX graph of a model, for any number of tiles of any size that suits the stride."""
+    """Return the ONNX graph of a model, for any number of tiles whose size is a multiple of the stride."""
     side = torch.export.Dim("rows"), torch.export.Dim("cols")
     sizes = {0: torch.export.Dim.DYNAMIC, 2: info.stride * side[0], 3: info.stride * side[1]}
     sample = torch.zeros(2, len(info.channels), 2 * info.stride, 3 * info.stride)
@@ -167,12 +167,12 @@ def _graph(model: nn.Module, info: ModelInfo) -> ModelProto:
 
 
 def _no_torchvision(record: logging.LogRecord) -> bool:
-    """Keep torch from saying that torchvision, which nobody needs here, is not installed."""
+    """Suppress torch's message that torchvision, which is not needed here, is not installed."""
     return "torchvision" not in record.getMessage()
 
 
 def _strip(onnx_model: ModelProto) -> None:
-    """Remove what the exporter notes about the code it read, paths on this machine among it."""
+    """Remove the notes of the exporter about the source code, which include paths on this machine."""
     graph = onnx_model.graph
     del onnx_model.metadata_props[:]
     del graph.metadata_props[:]
@@ -183,7 +183,7 @@ def _strip(onnx_model: ModelProto) -> None:
 
 
 def _halve(onnx_model: ModelProto) -> None:
-    """Store large initialisers in half precision, each with a cast back to single precision behind it."""
+    """Store large initialisers in half precision, each followed by a cast to single precision."""
     graph = onnx_model.graph
     cast: dict[str, str] = {}
     for tensor in graph.initializer:
@@ -202,7 +202,7 @@ def _halve(onnx_model: ModelProto) -> None:
 
 
 def _sample(info: ModelInfo) -> NDArray[np.float32]:
-    """Return tiles of random points and lines, as a network may see them."""
+    """Return tiles of random points and lines, similar to the input of a network."""
     side, channels = 8 * info.stride, len(info.channels)
     rng = np.random.default_rng(0)
     counts = rng.poisson(0.02, (2, channels, side, side))

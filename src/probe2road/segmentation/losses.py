@@ -1,4 +1,4 @@
-"""The losses that the segmentation network is trained with.
+"""The losses for training the segmentation network.
 
 Strategy
 --------
@@ -38,22 +38,22 @@ __all__ = ["Loss", "LossOptions", "bce_dice", "cp_loss", "loss_function"]
 Loss = Callable[[Tensor, Tensor, int], Tensor]
 """Logits, target and the number of the training step (from 0) to the loss, a scalar."""
 
-_XI, _ETA = 0.25, 0.5  # of the weight in the Dice term, METHOD 2.1; up to 0.5 the gradient on road is never positive
+_XI, _ETA = 0.25, 0.5  # weights in the Dice term (METHOD 2.1); up to 0.5 the gradient on road is never positive
 _LIMIT = 1e4  # logits; far beyond what networks put out, and small enough to stay finite when squared and summed
 
 
 @dataclass(frozen=True)
 @checked
 class LossOptions:
-    """What training minimises."""
+    """The loss that training minimises."""
 
     kind: Literal["bce_dice", "cp"] = "cp"  # bce_dice, or cp: the connectivity-preserving loss
     warm_up: NotNegative[int] = 2000  # steps of BCE + Dice before CP-loss; 30 epochs of the paper (METHOD 0.1 row 9)
     sigma: Positive[float] = 100.0  # px, reach of a wrong skeleton (METHOD 0.1 row 11)
-    buffer: Buffer = "2x2"  # what a skeleton may deviate: 2x2 (the paper's, one-sided) or 3x3
-    thinning: Method = "zhang_suen"  # how skeletons are made for CP-loss: zhang_suen (the source's) or guo_hall
+    buffer: Buffer = "2x2"  # how far a skeleton may deviate: 2x2 (the paper's, one-sided) or 3x3
+    thinning: Method = "zhang_suen"  # thinning for CP-loss: zhang_suen (as in its source) or guo_hall
     threshold: Probability = 0.5  # probability from which a pixel is in the mask that is thinned
-    ce_weight: NotNegative[float] = 1.0  # of the mean cross entropy beside the Dice term, in both losses
+    ce_weight: NotNegative[float] = 1.0  # weight of the mean cross entropy beside the Dice term, in both losses
     smooth: NotNegative[float] = 1.0  # pixels added above and below the fraction of the Dice term
 
 
@@ -154,7 +154,7 @@ def cp_loss(
 
 
 def loss_function(options: LossOptions | None = None) -> Loss:
-    """Return the loss that a training loop calls with logits, target and the number of the step.
+    """Return the loss as a function of logits, target and step number, for a training loop.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def _weights(logits: Tensor, target: Tensor, options: LossOptions, pool: Executo
 
 
 def _in_float32(logits: Tensor, *maps: Tensor) -> list[Tensor]:
-    """Return logits within their limit and the maps that belong to them; nothing is broadcast by accident."""
+    """Return logits, limited in size, and their maps in single precision; all must have the same shape."""
     shapes = [tuple(each.shape) for each in (logits, *maps)]
     if len(set(shapes)) > 1:
         wrong = f"logits have shape {shapes[0]}, target and weights {', '.join(map(str, shapes[1:]))}"
@@ -216,5 +216,5 @@ def _in_float32(logits: Tensor, *maps: Tensor) -> list[Tensor]:
 
 
 def _dice(shared: Tensor, total: Tensor, smooth: float) -> Tensor:
-    """Return the Dice loss; 1 where there is nothing and no smoothing."""
+    """Return the Dice loss; 1 for empty masks without smoothing."""
     return 1 - (shared + smooth) / (total + smooth).clamp(min=torch.finfo(torch.float32).tiny)

@@ -1,4 +1,4 @@
-"""Probability to mask, with memory for the road pixels rather than for the area."""
+"""From probability to mask, with memory in proportion to the road pixels rather than to the area."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ __all__ = ["MaskOptions", "threshold_mask"]
 @dataclass(frozen=True)
 @checked
 class MaskOptions:
-    """Which probability makes a road; where a threshold is None, the segmenter's own."""
+    """Which probability counts as road; a threshold of None takes that of the segmenter."""
 
     threshold: Probability | None = None  # probability that continues a road
-    seed_threshold: Probability | None = None  # probability that starts one
+    seed_threshold: Probability | None = None  # probability that starts a road
 
     def __post_init__(self) -> None:
-        """Refuse thresholds that are out of order."""
+        """Refuse a seed threshold below the threshold."""
         if self.threshold is not None and self.seed_threshold is not None and self.threshold > self.seed_threshold:
             fault = f"threshold is {self.threshold}, seed_threshold is {self.seed_threshold}"
             raise OptionError(fault, where="MaskOptions", fix="use threshold <= seed_threshold")
 
     def of(self, segmenter: Segmenter) -> tuple[float, float]:
-        """Return threshold and seed threshold for what a segmenter predicts.
+        """Return the threshold and the seed threshold for the output of a segmenter.
 
-        A threshold that is given raises the segmenter's own seed threshold at least to itself.
+        If only the threshold is given, the segmenter's seed threshold is raised to it where it is lower.
         """
         threshold = segmenter.threshold if self.threshold is None else self.threshold
         seed_threshold = self.seed_threshold
@@ -56,7 +56,7 @@ def threshold_mask(probability: Blocks, *, threshold: float, seed_threshold: Pro
 def threshold_mask(
     probability: NDArray[Any] | Blocks, *, threshold: float, seed_threshold: Probability | None = None
 ) -> NDArray[np.bool_] | Blocks:
-    """Return where the probability reaches a threshold, in parts that somewhere reach a higher one.
+    """Return the parts where the probability reaches a threshold and, somewhere in the part, a higher one.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def threshold_mask(
 
 
 def _parts(pixels: NDArray[np.int64], cols: int) -> NDArray[np.int64]:
-    """Label the 8-connected parts of a set of pixels given by ascending flat indices."""
+    """Label the 8-connected parts of a set of pixels, given by ascending flat indices."""
     pairs = []
     col = pixels % cols
     for step, inside in ((1, col < cols - 1), (cols - 1, col > 0), (cols, col >= 0), (cols + 1, col < cols - 1)):

@@ -1,4 +1,4 @@
-"""The learned segmenter: a network from a weights file, tiled over the area."""
+"""The learned segmenter: a network from a weights file, applied to the area tile by tile."""
 
 from __future__ import annotations
 
@@ -25,25 +25,23 @@ __all__ = ["NetworkOptions", "find_weights", "network_segmenter", "shipped_weigh
 
 logger = logging.getLogger(__name__)
 
-_STEPS = np.float32(2**16)  # of the probability between 0 and 1: fewer digits, which compress
+_STEPS = np.float32(2**16)  # of the probability between 0 and 1: fewer digits compress better
 _NO_NETWORK = 'use segmenter="density"'
 
 
 @dataclass(frozen=True)
 @checked
 class NetworkOptions:
-    """Which network to run, and how."""
+    """Which network runs, and how."""
 
-    weights: str | None = None  # file; the shipped one that suits the fleet where None
+    weights: str | None = None  # file; None: the shipped one that suits the fleet
     device: Annotated[str, OneOf(*DEVICES)] = "cpu"  # or "cuda"
-    threads: Positive[int] | None = None  # at most; all cores where None
-    runtime: Annotated[str, OneOf(*RUNTIMES)] | None = None  # OpenVINO where it is installed, else onnxruntime
-    precision: Annotated[str, OneOf(*PRECISIONS)] | None = None  # bfloat16 where processor and runtime have it
-    tile: Positive[int] | None = None  # px, side of the tiles that the network sees; the model's own where None
-    overlap: Annotated[float, AtLeast(0), AtMost(0.9)] = (
-        0.25  # of neighbouring tiles, as a part of their side; the paper's is 0.5
-    )
-    turns: Annotated[int, AtLeast(1), AtMost(4)] = 1  # right angles that every tile is turned by; the mean counts
+    threads: Positive[int] | None = None  # largest number of threads; None: one for each core
+    runtime: Annotated[str, OneOf(*RUNTIMES)] | None = None  # None: OpenVINO where it is installed, else onnxruntime
+    precision: Annotated[str, OneOf(*PRECISIONS)] | None = None  # None: bfloat16 where processor and runtime have it
+    tile: Positive[int] | None = None  # px, side of the tiles that the network sees; None: that of the model
+    overlap: Annotated[float, AtLeast(0), AtMost(0.9)] = 0.25  # of neighbouring tiles, share of their side; paper: 0.5
+    turns: Annotated[int, AtLeast(1), AtMost(4)] = 1  # rotations of every tile by right angles, whose mean is taken
 
 
 def shipped_weights(*, points: bool) -> Path:
@@ -62,7 +60,7 @@ def shipped_weights(*, points: bool) -> Path:
 
 
 def find_weights(fleet: Fleet, options: NetworkOptions) -> Weights:
-    """Read the weights for a fleet: those of the options, or the shipped ones that look at all the fleet has.
+    """Read the weights for a fleet: those in the options, or the shipped ones that use all of the fleet's channels.
 
     Raises
     ------
@@ -85,7 +83,7 @@ def find_weights(fleet: Fleet, options: NetworkOptions) -> Weights:
 
 
 def network_segmenter(weights: Weights, grid: Grid, options: NetworkOptions | None = None) -> Segmenter:
-    """Return the learned segmenter.
+    """Return the learned segmenter for a fleet.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The options that decide the centreline probability, and nothing behind it."""
+"""The options that determine the centreline probability, and no later stage."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ SEGMENTERS = ("network", "density")
 @dataclass(frozen=True)
 @checked
 class SegmentationOptions:
-    """Everything that the probability of a fleet depends on; a cached one is taken where these are the same."""
+    """All options that the probability depends on; a cached probability is used if they are equal."""
 
     resolution: Positive[float] = 1.0  # m per pixel
     segmenter: Annotated[str, OneOf(*SEGMENTERS)] = "network"  # one of SEGMENTERS
     gaps: TraceGaps = field(default_factory=TraceGaps)  # where traces are broken
-    network: NetworkOptions = field(default_factory=NetworkOptions)  # of the learned segmenter
-    density: DensityOptions = field(default_factory=DensityOptions)  # of the density segmenter
+    network: NetworkOptions = field(default_factory=NetworkOptions)  # options of the learned segmenter
+    density: DensityOptions = field(default_factory=DensityOptions)  # options of the density segmenter

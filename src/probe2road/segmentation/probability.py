@@ -31,7 +31,7 @@ def find_segmenter(
     weights: Weights | None = None,
     workspace: Workspace | None = None,
 ) -> Segmenter:
-    """Return the segmenter of the options; what the density segmenter estimates is estimated once per run.
+    """Return the segmenter that the options name; the density segmenter estimates its bandwidth once per run.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def find_segmenter(
     options
         Which segmenter, and how it works.
     weights
-        Of the network; the density segmenter where it is None.
+        Of the network; the density segmenter if it is None.
     workspace
         Where estimates are kept.
     """
@@ -66,7 +66,7 @@ def centreline_probability(
     workspace: Workspace | None = None,
     progress: Progress | None = None,
 ) -> Blocks:
-    """Return the centreline probability of the whole grid.
+    """Return the centreline probability of all pixels of a grid.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What every segmenter is: counts in, centreline probability out, window by window."""
+"""The interface of every segmenter: counts in, centreline probability out, window by window."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Segmenter"]
 
 @dataclass(frozen=True)
 class Segmenter:
-    """A way to turn count rasters into the probability that a pixel lies on a road centreline.
+    """A method to turn count rasters into the probability that a pixel lies on a road centreline.
 
     Attributes
     ----------

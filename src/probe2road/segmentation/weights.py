@@ -1,4 +1,4 @@
-"""What a weights file is: one ONNX file that holds a network, what it expects and promises, and a checksum.
+"""The weights file: one ONNX file that holds a network, its metadata, and a checksum.
 
 Strategy
 --------
@@ -39,20 +39,20 @@ _COPY = "copy the file again"
 @dataclass(frozen=True)
 @checked
 class ModelInfo:
-    """What a network expects and promises, and where it comes from."""
+    """The metadata of a network: its input, its output, and where it comes from."""
 
     name: str  # of the model, for reports
     channels: Annotated[tuple[str, ...], NotEmpty()]  # names of probe2road.raster.counts.CHANNELS, in its order
     network: dict[str, Any] = field(default_factory=dict)  # what the network is built from, for training
     resolution: Positive[float] = 1.0  # m per pixel
     threshold: Probability = 0.5  # probability that continues a road
-    seed_threshold: Probability = 0.5  # probability that starts one
-    tile: Positive[int] = 1024  # px, side of the tiles it is meant to see
-    stride: Positive[int] = 32  # px; rows and columns of its input are multiples of it
+    seed_threshold: Probability = 0.5  # probability that starts a road
+    tile: Positive[int] = 1024  # px, side of the tiles that the network is made for
+    stride: Positive[int] = 32  # px; rows and columns of the input are multiples of this
     training: dict[str, Any] = field(default_factory=dict)  # configuration, seed, steps, data, scores
 
     def __post_init__(self) -> None:
-        """Refuse what no network can mean."""
+        """Refuse metadata that no network can have."""
         where = f"model {self.name}"
         if len(set(self.channels)) < len(self.channels):
             raise OptionError(f"channels are {list(self.channels)}", where=where, fix="name each one once")
@@ -69,7 +69,7 @@ class ModelInfo:
 
 @dataclass(frozen=True)
 class Weights:
-    """A weights file in memory, found to be complete and ours."""
+    """A weights file in memory, checked to be complete and from probe2road."""
 
     info: ModelInfo
     model: bytes  # the whole file, an ONNX model
@@ -78,7 +78,7 @@ class Weights:
 
 
 def network_input(counts: ArrayLike) -> NDArray[np.float32]:
-    """Return what networks look at: log10(1 + count), of any shape.
+    """Return the input of networks for counts of any shape: log10(1 + count).
 
     Notes
     -----
@@ -133,7 +133,7 @@ def read_weights(path: str | Path) -> Weights:
 
 
 def _info(table: dict[str, Any], path: Path) -> ModelInfo:
-    """Return the metadata of one file; entries that a later version added without raising the format are left out."""
+    """Return the metadata of a file without the entries that a later version has added to the same format."""
     known = {field.name for field in fields(ModelInfo)}
     try:
         return ModelInfo(
@@ -144,7 +144,7 @@ def _info(table: dict[str, Any], path: Path) -> ModelInfo:
 
 
 def _metadata(data: bytes, path: Path) -> tuple[bytes, str]:
-    """Return our metadata and the digest in a file's content, found to be complete."""
+    """Return our metadata and the digest in a file's content, after a check that it is complete."""
     entries, place = {}, 0
     try:
         for number, start, content in _fields(data):
@@ -158,7 +158,7 @@ def _metadata(data: bytes, path: Path) -> tuple[bytes, str]:
         raise InputError("not a weights file", where=path, fix=_NOT_OURS) from error
     if _INFO not in entries:
         raise InputError("not a weights file of probe2road", where=path, fix=_NOT_OURS)
-    digest = _digest(data[:place])  # the digest is the last field, and of all before it
+    digest = _digest(data[:place])  # the digest is the last field; it covers everything before it
     if entries.get(_DIGEST) != digest.encode():
         raise InputError("the weights are damaged: their checksum differs", where=path, fix=_COPY)
     return entries[_INFO], digest
@@ -179,7 +179,7 @@ def _field(number: int, content: bytes) -> bytes:
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Walk the fields of a protocol buffer message: number, first byte, content (empty unless length-delimited).
+    """Yield the fields of a protocol buffer message: number, first byte, content (empty unless length-delimited).
 
     Raises EOFError where the message ends inside a field, and ValueError where it is no message.
     """
@@ -204,7 +204,7 @@ def _fields(data: bytes) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _varint(data: bytes, place: int) -> tuple[int, int]:
-    """Return a number in base 128, lowest digits first, and the place after it."""
+    """Return a number in base 128, lowest digits first, and the position after it."""
     value = shift = 0
     while shift < 64:
         if place >= len(data):

@@ -1,4 +1,4 @@
-"""The fleet simulator: road networks to 3-D lanes, traffic and sensors, to fleet data with known truth."""
+"""The fleet simulator: from road networks to 3-D lanes, traffic and sensors, to fleet data with known truth."""
 
 from pkgutil import iter_modules
 

@@ -48,7 +48,7 @@ _WORLD, _DRIVE, _VEHICLE = 0, 1, 2  # first key of the random streams
 
 @dataclass(frozen=True, eq=False)
 class FleetChunk:
-    """Some consecutive drives: raw fleet data, and the truth behind it."""
+    """Several consecutive drives: raw fleet data, and their truth."""
 
     traces: pd.DataFrame  # as in `probe2road.fleet.contract.Fleet`
     points: pd.DataFrame  # the same
@@ -59,7 +59,7 @@ class FleetChunk:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedFleet:
-    """Fleet data as vehicles would record it, and the truth behind it.
+    """Fleet data as vehicles would record it, and its truth.
 
     Attributes
     ----------
@@ -85,13 +85,13 @@ class SimulatedFleet:
         return f"SimulatedFleet({self.fleet!r} on {self.reference!r})"
 
     def _repr_html_(self) -> str:
-        """Show figures in a notebook, and no id."""
+        """Show figures in a notebook, without any ids."""
         return f"<b>SimulatedFleet</b><br>{self.fleet._repr_html_()}{self.reference._repr_html_()}"
 
 
 @dataclass(frozen=True)
 class FleetWorld:
-    """Everything that is the same for all drives; sent once to each worker process."""
+    """The data shared by all drives, sent once to each worker process."""
 
     preset: Preset
     seed: int
@@ -179,7 +179,7 @@ def simulate_chunks(
     first_drive: int = 0,
     chunk_drives: int = 50,
 ) -> Iterator[FleetChunk]:
-    """Yield the drives of a fleet in order, some at a time, with memory for a few chunks only.
+    """Yield the drives of a fleet in order and in chunks, with memory for only a few chunks.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def simulate_drive(world: FleetWorld, number: int) -> tuple[TruePoses, RecordedP
 
 
 def fleet_world(network: RoadNetwork, preset: Preset, *, seed: int) -> FleetWorld:
-    """Prepare a network for simulation: demand, lanes, what the cameras can see, how much sky there is."""
+    """Prepare a network for simulation: demand, lanes, features that cameras can see, and visibility of the sky."""
     traffic = traffic_world(network, preset.demand, rng=_stream(seed, _WORLD, 0))
     features = None
     if preset.camera is not None:
@@ -291,12 +291,12 @@ def visible_features(network: RoadNetwork, *, seed: int) -> RoadFeatures:
 
 
 def _stream(seed: int, *keys: int) -> np.random.Generator:
-    """Return the random stream of a thing: a function of the seed and the thing's keys alone."""
+    """Return the random stream of an object: a function of the seed and the keys of the object alone."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=keys))
 
 
 def _exposures(network: RoadNetwork, model: SurroundingsModel, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Factor on the burst rate of every section, with mean as given for its class."""
+    """Return the factor on the burst rate of every section; its mean is that of the road class."""
     by_class = network.sections["highway"].map(lambda name: model.exposure.get(name, model.other_exposure))
     local = np.exp(model.spread * rng.standard_normal(len(by_class)) - model.spread**2 / 2.0)
     return by_class.to_numpy(np.float64) * local
@@ -305,7 +305,7 @@ def _exposures(network: RoadNetwork, model: SurroundingsModel, rng: np.random.Ge
 def _fix_rows(
     poses: TruePoses, covered: NDArray[np.bool_], recording: RecordingModel, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Rows of the poses that a phone records: one in each interval, none where there is no sky."""
+    """Return the rows of the poses that a phone records: one in each interval, none where there is no sky."""
     low, high = np.log(recording.fix_interval)
     interval = np.exp(rng.uniform(low, high))
     slot = np.floor((poses.t - poses.t[0]) / interval + rng.random())
@@ -315,7 +315,7 @@ def _fix_rows(
 
 
 def _jobs(first: int, end: int | None, size: int) -> Iterator[tuple[int, int]]:
-    """Ranges of drives: first number and the number behind the last."""
+    """Return ranges of drives: the first number, and the number after the last."""
     for start in count(first, size):
         if end is not None and start >= end:
             return
@@ -323,7 +323,7 @@ def _jobs(first: int, end: int | None, size: int) -> Iterator[tuple[int, int]]:
 
 
 def _chunk(world: FleetWorld, start: int, end: int) -> FleetChunk:
-    """Simulate drives start to end - 1."""
+    """Simulate the drives from start to end - 1."""
     tables: dict[str, list[pd.DataFrame]] = {"traces": [], "points": [], "poses": [], "routes": []}
     lengths = []
     for number in range(start, end):
@@ -337,7 +337,7 @@ def _chunk(world: FleetWorld, start: int, end: int) -> FleetChunk:
 
 
 def _departure(world: FleetWorld, number: int) -> np.datetime64:
-    """When a drive begins: any time of the fleet's weeks, from a stream of its own."""
+    """Draw the start time of a drive within the weeks of the fleet, from a random stream of its own."""
     recording = world.preset.recording
     first = pd.Timestamp(recording.first_day).tz_convert("UTC").tz_localize(None).to_datetime64()
     seconds = _stream(world.seed, _DRIVE, number, 1).random() * recording.days * 86400.0
@@ -345,7 +345,7 @@ def _departure(world: FleetWorld, number: int) -> np.datetime64:
 
 
 def _until(chunks: Iterable[FleetChunk], length: float | None) -> Iterator[FleetChunk]:
-    """Yield chunks until so many metres are driven; the last is cut behind the drive that reaches them."""
+    """Yield chunks until a driven distance (m) is reached; the last chunk ends with the drive that reaches it."""
     driven = 0.0
     for chunk in chunks:
         total = driven + np.cumsum(chunk.length)
@@ -368,7 +368,7 @@ _worker_world: FleetWorld | None = None
 
 
 def _start_worker(world: FleetWorld) -> None:
-    """Keep the world in a worker process, so that it travels once and not with every chunk."""
+    """Store the shared data in a worker process, so that it is sent once and not with every chunk."""
     global _worker_world
     _worker_world = world
 

@@ -1,4 +1,4 @@
-"""The presets of the fleet simulator: every number in one place, with its source.
+"""The presets of the fleet simulator: all numbers in one place, with their sources.
 
 Numbers that were fitted name the recording; those that nobody measured are marked as chosen. `experiments/fit_gnss.py`
 repeats the fits, and docs/results/calibration.md compares the outcome with the recordings.
@@ -25,7 +25,7 @@ __all__ = ["PRESETS", "Preset", "RecordingModel", "SurroundingsModel", "find_pre
 @dataclass(frozen=True)
 @checked
 class SurroundingsModel:
-    """How much of the sky the surroundings hide: a factor on the rate of multipath bursts, by road class."""
+    """How much the surroundings hide of the sky: a factor on the rate of multipath bursts, by road class."""
 
     exposure: Mapping[str, NotNegative[float]] = field(
         default_factory=lambda: {"motorway": 0.2, "motorway_link": 0.3, "trunk": 0.5, "trunk_link": 0.6}
@@ -37,7 +37,7 @@ class SurroundingsModel:
 @dataclass(frozen=True)
 @checked
 class RecordingModel:
-    """What a drive leaves in the data."""
+    """What a vehicle or phone records of a drive."""
 
     pose_spacing: Positive[float] = 2.5  # m between poses, and keyframes of the camera, of a moving vehicle
     standing_interval: Positive[float] = 1.0  # s between poses of a standing one
@@ -50,7 +50,7 @@ class RecordingModel:
 @dataclass(frozen=True)
 @checked
 class Preset:
-    """Everything that the simulator knows about one kind of fleet."""
+    """All parameters of the simulator for one kind of fleet."""
 
     name: str
     gnss: GnssModel
@@ -192,7 +192,7 @@ def find_preset(name: str | Path | Preset) -> Preset:
 
 
 def read_preset(path: str | Path) -> Preset:
-    """Read a preset from a TOML file: a base and what differs from it.
+    """Read a preset from a TOML file: the name of a base preset, and the fields that differ.
 
     ``base`` names the preset to start from (mixed where absent); each table (``gnss``, ``fusion``, ``odometry``,
     ``camera``, ``surroundings``, ``demand``, ``driver``, ``recording``) replaces fields of that name.

@@ -1,4 +1,4 @@
-"""From one simulated drive to the tables of fleet data, and from routes to the true numbers of drives."""
+"""From a simulated drive to the tables of fleet data, and from routes to the true numbers of drives."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CENTIMETRES = 2  # decimals kept of recorded coordinates
 
 @dataclass(frozen=True)
 class DriveLabels:
-    """What identifies one drive in the data."""
+    """The ids and the start time of one drive in the data."""
 
     trace_id: int
     vehicle_id: int
@@ -30,7 +30,7 @@ class DriveLabels:
 
 @dataclass(frozen=True)
 class RecordedPoses:
-    """What a vehicle recorded of its own motion: n of its poses."""
+    """The n poses that a vehicle recorded of its motion."""
 
     rows: NDArray[np.int64]  # (n,) row of the true pose
     xyz: NDArray[np.float64]  # (n, 3) m
@@ -46,7 +46,7 @@ def drive_tables(
     recorded: RecordedPoses,
     seen: Detections | None,
 ) -> dict[str, pd.DataFrame]:
-    """Turn one drive into tables.
+    """Convert one drive to tables.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def drive_tables(
 
 
 def _points(number: int, t: pd.DatetimeIndex, recorded: RecordedPoses, seen: Detections | None) -> pd.DataFrame:
-    """Place camera points where the vehicle believes to be: the fused pose, applied to the vehicle frame."""
+    """Place camera points with the pose that the vehicle recorded: the fused pose, applied to the vehicle frame."""
     if seen is None:
         frame, body, kind = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0, np.int8)
     else:

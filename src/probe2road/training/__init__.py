@@ -1,4 +1,4 @@
-"""Training the segmentation network: scenes, samples, configuration, the loop, and what decides its checkpoint."""
+"""Training of the segmentation network: scenes, samples, configuration, the loop, and the choice of the checkpoint."""
 
 from pkgutil import iter_modules
 

@@ -23,7 +23,7 @@ SHIPPED = ("gnss-vision", "gnss", "paper")  # configurations that come with the 
 @dataclass(frozen=True)
 @checked
 class ValidationOptions:
-    """What chooses the checkpoint: scores on squares that no training sample touches."""
+    """How the checkpoint is chosen: by scores on squares that no training sample touches."""
 
     sources: tuple[TrainingSource, ...] = (TrainingSource(name="milan"),)  # data sets
     squares: Positive[int] = 10  # of each source, spread over it
@@ -34,7 +34,7 @@ class ValidationOptions:
 @dataclass(frozen=True)
 @checked
 class TrainConfig:
-    """Everything that decides which weights come out."""
+    """All options that determine the trained weights."""
 
     name: str = "model"  # of the model
     seed: NotNegative[int] = 1
@@ -56,13 +56,13 @@ class TrainConfig:
     keep_every: Positive[int] = 500  # steps between checkpoints to resume from
 
     def __post_init__(self) -> None:
-        """Refuse to learn from nothing."""
+        """Refuse a configuration without anything to learn from."""
         if not any(source.weight > 0 for source in self.sources):
             raise OptionError("there are no sources", where="TrainConfig", fix="name data sets, or fleets of your own")
 
     @property
     def channel_rows(self) -> tuple[int, ...]:
-        """Position of each input channel in the rasters."""
+        """Return the position of each input channel in the rasters."""
         return tuple(CHANNELS.index(name) for name in self.channels)
 
 

@@ -24,7 +24,7 @@ def write_curve(curve: Sequence[dict[str, float]], path: str | Path) -> None:
 
 
 def draw_curves(curve: Sequence[dict[str, float]], path: str | Path, *, title: str = "") -> None:
-    """Draw a curve as a PNG: the loss, and the scores that choose the weights.
+    """Draw a curve as a PNG: the loss, and the scores by which the weights are chosen.
 
     Parameters
     ----------

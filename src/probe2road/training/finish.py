@@ -1,4 +1,4 @@
-"""From the best weights of a run to a weights file: threshold chosen on the validation squares, story told."""
+"""From the best weights of a run to a weights file, with a threshold from the validation squares and a description."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ THRESHOLDS = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 
 
 def export_best(config: TrainConfig, state: TrainingState, output: str | Path, *, sets: str | Path) -> Path:
-    """Write the best weights of a run as a weights file that `probe2road build` takes.
+    """Write the best weights of a run as a weights file for ``probe2road build``.
 
     Of `THRESHOLDS` the one with the best validation score becomes the model's own (METHOD 0.1 row 12).
 

@@ -1,4 +1,4 @@
-"""The training loop: seeded sample by sample, so that a run that was cut off goes on as if it had not been."""
+"""The training loop: every sample has its own seed, so that an interrupted run continues as if uninterrupted."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def train(
     stop_after: float | None = None,
     progress: Progress | None = None,
 ) -> TrainingState:
-    """Train a network; goes on where an earlier run with the same output folder stopped.
+    """Train a network, or continue the run in the same output folder.
 
     Started by ``torchrun`` in several processes, each draws its own samples and they share their gradients.
 
@@ -127,7 +127,7 @@ def train(
 def _batches(
     config: TrainConfig, scenes: Sequence[tuple[Scene, float]], first: int, rank: int
 ) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Yield step, input ``(n, c, h, w)`` and label ``(n, 1, h, w)``; the next batch is drawn while one is used."""
+    """Yield step, input ``(n, c, h, w)`` and label ``(n, 1, h, w)``; the next batch is drawn in the background."""
     weights = np.array([weight for _, weight in scenes])
     rows = list(config.channel_rows)
 
@@ -150,21 +150,21 @@ def _batches(
 
 
 def learning_rate(config: TrainConfig, step: int) -> float:
-    """Learning rate of a step."""
+    """Return the learning rate of a step."""
     rise = min(1.0, (step + 1) / max(config.warm_up, 1))
     fall = 1.0 if config.schedule == "constant" else 0.5 * (1.0 + np.cos(np.pi * step / config.steps))
     return float(config.learning_rate * rise * fall)
 
 
 def _mixed(config: TrainConfig, where: torch.device) -> AbstractContextManager[None]:
-    """Compute in bfloat16 where that is asked for."""
+    """Compute in bfloat16, if the options ask for it."""
     return torch.autocast(where.type, torch.bfloat16, enabled=config.precision == "bf16")
 
 
 def _validate(
     state: TrainingState, config: TrainConfig, squares: Sequence[Square], output: Path, *, loss: float, pace: float
 ) -> None:
-    """Score the network, add a row to the curve, and keep the weights if none were better."""
+    """Score the network, add a row to the curve, and keep the weights if they are the best so far."""
     probabilities = predict_squares(state.network, config, squares)
     row = {"step": float(state.step), "loss": loss, "seconds_per_step": pace, **validate(squares, probabilities)}
     state.curve.append(row)
@@ -183,7 +183,7 @@ def _validate(
 
 
 def predict_squares(network: nn.Module, config: TrainConfig, squares: Sequence[Square]) -> list[NDArray[np.float32]]:
-    """Return the probability of each square ``(size, size)``, computed as in training, but in evaluation mode."""
+    """Return the probability of each square ``(size, size)``, in the precision of training but in evaluation mode."""
     network.eval()
     where = next(network.parameters()).device
     probabilities = []
@@ -196,7 +196,7 @@ def predict_squares(network: nn.Module, config: TrainConfig, squares: Sequence[S
 
 
 def use_threads(threads: int) -> None:
-    """Compute with at most so many threads.
+    """Compute with at most the given number of threads inside the block.
 
     Raises
     ------
@@ -209,12 +209,12 @@ def use_threads(threads: int) -> None:
 
 
 def is_first() -> bool:
-    """Say whether this process is the one that writes, of those that a launcher started."""
+    """Tell whether this is the process that writes files, among those that a launcher started."""
     return os.environ.get("RANK", "0") == "0"
 
 
 def _join(device: str) -> tuple[torch.device, int, int]:
-    """Return the device, the number of this process and that of all; joins them where a launcher started several."""
+    """Return the device, the number of this process and of all; connect the processes if a launcher started several."""
     if device not in ("auto", "cpu", "cuda"):
         raise OptionError(f"there is no device {device!r}", fix="use auto, cpu or cuda")
     there = torch.cuda.is_available()

@@ -1,4 +1,4 @@
-"""Samples: squares of a scene, turned, thinned and disturbed at random, as count rasters with their labels.
+"""Samples: squares of a scene, randomly rotated, thinned and disturbed, as count rasters with their labels.
 
 Everything happens to the vectors before they are drawn, so that a sample has what real rasters have: lines one
 pixel wide at any angle, and counts that are whole. Drives are left out before edges are counted, so that the
@@ -18,7 +18,7 @@ from probe2road.benchmark.sets.tiles import TILE_SIZE
 from probe2road.bounds import AtLeast, NotEmpty, NotNegative, Positive, Share
 from probe2road.options import checked
 from probe2road.raster.counts import count_pixels
-from probe2road.raster.lines import draw_lines
+from probe2road.raster.drawing import draw_lines
 from probe2road.training.scene import Scene, rows_around
 
 __all__ = ["Sample", "SampleOptions", "Vectors", "draw_sample", "sample_vectors", "square", "square_vectors"]
@@ -34,7 +34,7 @@ _FAST = 40.0  # m/s; with sparse fixes a segment may be as long as what is drive
 @dataclass(frozen=True)
 @checked
 class SampleOptions:
-    """What a sample is, and how it is varied."""
+    """The size of samples, and how they vary."""
 
     size: Annotated[int, AtLeast(32)] = 384  # pixels of 1 m
     min_drives: NotNegative[int] = 4  # distinct drives that make an edge a label; the N of the paper
@@ -53,7 +53,7 @@ class SampleOptions:
 
 @dataclass(frozen=True)
 class Sample:
-    """Input and answer."""
+    """The input of the network and its label."""
 
     counts: NDArray[np.uint32]  # (3, size, size)
     label: NDArray[np.uint8]  # (size, size), 1 on a centreline
@@ -61,7 +61,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Vectors:
-    """What is drawn in a sample, in its pixels; places may lie outside.
+    """The lines and points to draw in a sample, in its pixels; positions may lie outside.
 
     Letters: f fixes, p semantic points, v vertices of the edges that are the label.
     """
@@ -79,7 +79,7 @@ class Vectors:
     label_edge: NDArray[np.int64]  # (v,) edge of each vertex
 
     def drawn(self, label_width: int) -> Sample:
-        """Draw the rasters."""
+        """Draw the rasters of the sample."""
         shape = self.size, self.size
         points = self.point_row, self.point_col, self.point_kind
         counts = count_pixels(self.row, self.col, self.breaks, *points, shape)
@@ -88,31 +88,31 @@ class Vectors:
 
 @dataclass(frozen=True)
 class _Frame:
-    """Where a sample lies: pixel = turn @ (place - centre) + size / 2."""
+    """The frame of a sample: pixel = turn @ (place - centre) + size / 2."""
 
     centre: tuple[float, float]  # m from the scene's origin
     turn: NDArray[np.float64]  # (2, 2): place to (column, row)
     size: int
 
     def pixels(self, xy: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows and columns of places ``(n, 2)``."""
+        """Return the rows and columns of places ``(n, 2)``."""
         moved = (xy - np.asarray(self.centre)) @ self.turn.T + self.size / 2
         col, row = np.floor(moved).astype(np.int64).T
         return np.ascontiguousarray(row), np.ascontiguousarray(col)
 
 
 def draw_sample(scene: Scene, rng: np.random.Generator, options: SampleOptions) -> Sample:
-    """Draw a sample at random; the rasters of `sample_vectors`."""
+    """Return the rasters of a random sample; see `sample_vectors`."""
     return sample_vectors(scene, rng, options).drawn(options.label_width)
 
 
 def square(scene: Scene, centre: tuple[float, float], options: SampleOptions) -> Sample:
-    """Draw the square around a place as it is; the rasters of `square_vectors`."""
+    """Return the rasters of the square around a place, without any change; see `square_vectors`."""
     return square_vectors(scene, centre, options).drawn(options.label_width)
 
 
 def sample_vectors(scene: Scene, rng: np.random.Generator, options: SampleOptions) -> Vectors:
-    """Choose a place, a turn and drives at random, and fetch what these drives recorded there.
+    """Choose a place, a rotation and drives at random, and return what these drives recorded there.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def sample_vectors(scene: Scene, rng: np.random.Generator, options: SampleOption
 
 
 def square_vectors(scene: Scene, centre: tuple[float, float], options: SampleOptions) -> Vectors:
-    """Fetch the square around a place as it is: north up, all drives, nothing disturbed.
+    """Return the contents of the square around a place without any change: north up, all drives.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def square_vectors(scene: Scene, centre: tuple[float, float], options: SampleOpt
     centre
         ``(x, y)`` in metres from the scene's origin.
     options
-        Of which only ``size`` and ``min_drives`` are used.
+        Only ``size`` and ``min_drives`` are used.
     """
     frame = _Frame(centre, _TURNS[0], options.size)
     kept = np.ones(scene.n_drives, bool)
@@ -160,7 +160,7 @@ def square_vectors(scene: Scene, centre: tuple[float, float], options: SampleOpt
 
 
 def _turn(rng: np.random.Generator, options: SampleOptions) -> NDArray[np.float64]:
-    """Turn places into columns and rows, by any angle or by a right one, perhaps mirrored."""
+    """Draw a rotation from places to columns and rows, by any angle or by right angles, perhaps with a reflection."""
     if options.rotation == "any":
         angle = rng.uniform(0.0, 2 * np.pi)
         turn = np.array([[np.cos(angle), -np.sin(angle)], [-np.sin(angle), -np.cos(angle)]])
@@ -184,7 +184,7 @@ def _centre(scene: Scene, rng: np.random.Generator, options: SampleOptions) -> t
 
 
 def _kept_drives(scene: Scene, rng: np.random.Generator, options: SampleOptions) -> NDArray[np.bool_]:
-    """Leave drives out, in a share that is uniform on a logarithmic scale: shape ``(n_drives,)``."""
+    """Draw which drives are kept; their share is uniform on a logarithmic scale: shape ``(n_drives,)``."""
     if rng.random() < options.all_drives_share or options.least_drives == 1.0:
         return np.ones(scene.n_drives, bool)
     share = np.exp(rng.uniform(np.log(max(options.least_drives, 1e-3)), 0.0))
@@ -204,7 +204,7 @@ def _points(scene: Scene, frame: _Frame, kept: NDArray[np.bool_], reach: float) 
 
 
 def _labelled(scene: Scene, kept: NDArray[np.bool_], options: SampleOptions) -> NDArray[np.int64]:
-    """List the vertices of the edges that at least ``min_drives`` of the kept drives passed."""
+    """List the vertices of the edges that at least ``min_drives`` of the kept drives drove on."""
     total = np.concatenate([[0], np.cumsum(kept[scene.edge_drives])])
     support = total[scene.edge_starts[1:]] - total[scene.edge_starts[:-1]]
     return np.flatnonzero((support >= options.min_drives)[scene.vertex_edge])
@@ -219,7 +219,7 @@ def _vectors(
     late: float,
     vertices: NDArray[np.int64],
 ) -> Vectors:
-    """Bring fixes, points and vertices into the pixels of a frame, those of each drive moved by its offset."""
+    """Transform fixes, points and vertices to the pixels of a frame; each drive is moved by its offset."""
     drive, xyz = scene.fix_drive[fixes], scene.fix_xyz[fixes]
     xy = xyz[:, :2] + offset[drive]
     row, col = frame.pixels(xy)
@@ -237,7 +237,7 @@ def _vectors(
 def _sampled(
     drive: NDArray[np.int32], time: NDArray[np.float32], interval: float, phase: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Keep the first fix of each drive in every interval, whose beginning is random for each drive."""
+    """Keep the first fix of each drive in every interval; the intervals of each drive begin at a random time."""
     chosen = np.ones(len(drive), np.bool_)
     if interval <= 0.0:
         return chosen
@@ -251,7 +251,7 @@ def _sampled(
 def _breaks(
     drive: NDArray[np.int32], time: NDArray[np.float32], xy: NDArray[np.float32], late: float
 ) -> NDArray[np.bool_]:
-    """Mark fixes that no segment reaches from the fix before: another drive, a gap in time, or too long a step."""
+    """Mark fixes with no segment from the fix before: another drive, a gap in time, or too long a step."""
     breaks = np.ones(len(drive), bool)
     step = np.hypot(*np.diff(xy, axis=0).T)
     limit = max(_SEGMENT, _FAST * late / _LATE_INTERVALS)

@@ -1,4 +1,4 @@
-"""Scenes: fleet data and roads laid out so that any square of them can be fetched in milliseconds.
+"""Scenes: fleet data and roads stored so that any square of them can be read in milliseconds.
 
 Strategy: fixes, semantic points and reference edges become flat arrays, sorted by square cells of the plane where
 they have no other order. A fetch reads the few runs of rows that belong to the cells around a place. Which drives
@@ -63,14 +63,14 @@ class Scene:
 
     @property
     def n_drives(self) -> int:
-        """Number of drives."""
+        """Return the number of drives."""
         return int(self.fix_drive.max()) + 1 if len(self.fix_drive) else 0
 
 
 def make_scene(
     fleet: Fleet, reference: RoadGraph, driven: pd.DataFrame, *, area: shapely.Geometry | None = None
 ) -> Scene:
-    """Lay out fleet data and reference edges.
+    """Make a scene from fleet data and reference edges.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def make_scene(
 
 
 def save_scene(scene: Scene, folder: str | Path, *, about: dict[str, Any] | None = None) -> None:
-    """Write the arrays of a scene to a folder; complete once its ``scene.json`` is there.
+    """Write the arrays of a scene to a folder, which is complete once its ``scene.json`` exists.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def rows_around(
 
 
 def _fixes(fleet: Fleet, origin: NDArray[np.float64], table: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-    """Arrays of the fixes."""
+    """Return the arrays of the fixes."""
     traces = fleet.traces
     xy = traces[["x", "y"]].to_numpy() - origin
     drive = fleet.owner.astype(np.int32)
@@ -211,7 +211,7 @@ def _fixes(fleet: Fleet, origin: NDArray[np.float64], table: NDArray[np.int64]) 
 
 
 def _points(fleet: Fleet, origin: NDArray[np.float64], table: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-    """Arrays of the semantic points; those far from all traces go to the nearest cell, where no window finds them."""
+    """Return the arrays of the semantic points; points far from all traces go to a cell where no window finds them."""
     xy = (fleet.points[["x", "y"]].to_numpy() - origin).astype(np.float32)
     order, starts = _by_cell(xy, table)
     return {
@@ -223,7 +223,7 @@ def _points(fleet: Fleet, origin: NDArray[np.float64], table: NDArray[np.int64])
 
 
 def _by_cell(xy: NDArray[Any], table: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Sort places by cell: the order ``(n,)``, stable within a cell, and where each cell begins ``(k + 1,)``."""
+    """Sort places by cell: return the order ``(n,)``, stable within a cell, and the start of each cell ``(k + 1,)``."""
     rows, cols = int(table[0]), int(table[1])
     row = np.clip(np.floor(xy[:, 1] / CELL), 0, rows - 1).astype(np.int64)
     col = np.clip(np.floor(xy[:, 0] / CELL), 0, cols - 1).astype(np.int64)
@@ -243,7 +243,7 @@ def _roads(
     origin: NDArray[np.float64],
     area: shapely.Geometry | None,
 ) -> dict[str, NDArray[Any]]:
-    """Arrays of the reference edges and of the spots along them."""
+    """Return the arrays of the reference edges and of the spots along them."""
     lines = reference.edges.geometry.to_numpy()
     xy, owner = shapely.get_coordinates(lines, return_index=True)
     pairs = driven.drop_duplicates(["trace_id", "edge"])

@@ -1,4 +1,4 @@
-"""Where scenes come from: data sets of the benchmark, or fleet data with a reference of one's own."""
+"""The sources of scenes: data sets of the benchmark, or the user's fleet data and reference."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _SCENES = "scenes"  # folder of the laid-out scenes, beside the data sets
 @dataclass(frozen=True)
 @checked
 class TrainingSource:
-    """Fleet data and the roads it was recorded on: either a data set of the benchmark, or files."""
+    """Fleet data and the roads on which it was recorded: either a data set of the benchmark, or files."""
 
     name: str = "columbus"  # of a data set or a group of the benchmark, or what to call your own
     split: str = ""  # of the data set; all of it where empty
@@ -47,14 +47,14 @@ class TrainingSource:
     weight: NotNegative[float] = 1.0  # how often it is drawn, against the other sources
 
     def __post_init__(self) -> None:
-        """Refuse a source of nothing, or of two things."""
+        """Refuse a source that names neither a data set nor files, or both."""
         if self.name == "" or bool(self.fleet) != bool(self.reference):
             fix = "give the name of a data set, or a name, a fleet and a reference"
             raise OptionError("names nothing to learn from", where="source", fix=fix)
 
 
 def members(sources: Sequence[TrainingSource]) -> list[TrainingSource]:
-    """Replace groups of data sets by their members, which share the weight.
+    """Replace groups of data sets by their members, which share the weight of the group.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def members(sources: Sequence[TrainingSource]) -> list[TrainingSource]:
 
 
 def open_scene(source: TrainingSource, sets: str | Path) -> Scene:
-    """Return the scene of a source, laid out beside the data sets the first time it is asked for.
+    """Return the scene of a source, which is made beside the data sets at the first call.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def open_scene(source: TrainingSource, sets: str | Path) -> Scene:
 def driven_reference(
     source: TrainingSource, sets: str | Path, *, min_drives: int
 ) -> tuple[RoadGraph, shapely.Geometry | None]:
-    """Return the edges of a data set that enough drives passed, and the area of its split (None for all of it).
+    """Return the edges of a data set that enough drives drove on, and the area of its split (None for all of it).
 
     Raises
     ------
@@ -124,7 +124,7 @@ def driven_reference(
 
 
 def _make(source: TrainingSource, sets: Path) -> Scene:
-    """Lay a source out."""
+    """Make the scene of a source."""
     if source.fleet:
         fleet = read_fleet(source.fleet, source.points or None)
         pieces, driven = label_pieces(read_graph(source.reference).to_crs(fleet.crs), fleet, LabelOptions())
@@ -137,7 +137,7 @@ def _make(source: TrainingSource, sets: Path) -> Scene:
 
 
 def _recording(source: TrainingSource, sets: str | Path) -> Recording:
-    """Return the recording of a data set that is there."""
+    """Return the recording of an existing data set."""
     recording = Recording(Path(sets) / source.name)
     if not recording.reference.exists():
         fix = f"run probe2road benchmark prepare {source.name} --output {sets}"
@@ -146,7 +146,7 @@ def _recording(source: TrainingSource, sets: str | Path) -> Recording:
 
 
 def _files(source: TrainingSource, sets: str | Path) -> list[Path]:
-    """List the files that decide whether a scene is still that of its source."""
+    """List the files that determine whether a scene is up to date."""
     if source.fleet:
         return [Path(path) for path in (source.fleet, source.points, source.reference) if path]
     recording = _recording(source, sets)
@@ -157,7 +157,7 @@ def _files(source: TrainingSource, sets: str | Path) -> list[Path]:
 
 
 def _changed(path: Path) -> int:
-    """When a file was changed, ns."""
+    """Return the time at which a file was changed, ns."""
     if not path.exists():
         raise MissingFileError("is missing", where=path)
     return int(np.int64(path.stat().st_mtime_ns))

@@ -30,7 +30,7 @@ _FREE = ("keep_every",)  # what may change between a run and its resumption
 
 @dataclass
 class TrainingState:
-    """Everything that the next step depends on."""
+    """All state on which the next training step depends."""
 
     network: DLinkNet
     optimiser: torch.optim.Optimizer
@@ -40,7 +40,7 @@ class TrainingState:
 
 
 def build_network(config: TrainConfig) -> DLinkNet:
-    """Return the network of a configuration, with seeded random weights or those of the file it starts from."""
+    """Return the network of a configuration, with seeded random weights or with those of the given weights file."""
     torch.manual_seed(config.seed)
     network = DLinkNet(find_architecture(config.architecture), channels=len(config.channels))
     if config.start_from:
@@ -49,7 +49,7 @@ def build_network(config: TrainConfig) -> DLinkNet:
 
 
 def open_state(config: TrainConfig, folder: Path, device: torch.device) -> TrainingState:
-    """Return the state that a folder keeps, or that of a run that begins.
+    """Return the training state stored in a folder, or that of a new run.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def open_state(config: TrainConfig, folder: Path, device: torch.device) -> Train
 
 
 def keep_state(state: TrainingState, config: TrainConfig, folder: Path) -> None:
-    """Write the checkpoint from which a run goes on."""
+    """Write the checkpoint from which a run continues."""
     kept = {
         "config": _identity(config), "network": state.network.state_dict(), "optimiser": state.optimiser.state_dict(),
         "step": state.step, "best": state.best, "curve": state.curve,
@@ -88,11 +88,11 @@ def keep_state(state: TrainingState, config: TrainConfig, folder: Path) -> None:
 
 
 def keep_best(state: TrainingState, folder: Path) -> None:
-    """Write the weights of the network as the best so far."""
+    """Write the weights of the network as the best weights so far."""
     with atomic_path(folder / BEST) as temporary:
         torch.save(state.network.state_dict(), temporary)
 
 
 def _identity(config: TrainConfig) -> dict[str, Any]:
-    """Describe a configuration so that it can be compared with one that was read back."""
+    """Return a configuration in a form that can be compared with one that was read back."""
     return {name: value for name, value in json.loads(json.dumps(asdict(config))).items() if name not in _FREE}

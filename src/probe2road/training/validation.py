@@ -1,4 +1,4 @@
-"""What chooses the checkpoint: soft F1 of the masks and GEO F1 of the graphs drawn from them, on fixed squares."""
+"""The choice of the checkpoint: soft F1 of masks and GEO F1 of the graphs made from them, on fixed squares."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ __all__ = ["Square", "validate", "validation_squares"]
 
 @dataclass(frozen=True)
 class Square:
-    """A square to validate on."""
+    """A square for validation."""
 
     counts: NDArray[np.uint32]  # (3, size, size)
     label: NDArray[np.uint8]  # (size, size)
@@ -44,7 +44,7 @@ class Square:
 
 
 def validation_squares(options: ValidationOptions, sample: SampleOptions, sets: str | Path) -> list[Square]:
-    """Draw the squares: of each source, evenly spread from those with the most to those with the least road.
+    """Choose squares of each source for validation, evenly from those with the most road to those with the least.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def validation_squares(options: ValidationOptions, sample: SampleOptions, sets: 
 def validate(
     squares: Sequence[Square], probabilities: Sequence[NDArray[np.float32]], *, threshold: float = 0.5
 ) -> dict[str, float]:
-    """Score predictions on the squares, pooled over all.
+    """Score predictions on the squares, with the counts of all squares pooled.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def validate(
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what building these graphs has to say out of the log of a training."""
+    """Keep the log messages of building the validation graphs out of the log of a training."""
     logger = logging.getLogger("probe2road")
     level = logger.level
     logger.setLevel(max(level, logging.WARNING))

@@ -1,4 +1,4 @@
-"""Mask in, road graph out: lines of one pixel, chains of pixels, edges."""
+"""Vectorisation: from a mask to lines of one pixel, to chains of pixels, to a road graph."""
 
 from pkgutil import iter_modules
 

@@ -1,4 +1,4 @@
-"""Pixel polylines to a road graph in metres: smoothing, simplification, coordinates, scores.
+"""From pixel lines to a road graph in metres: smoothing, simplification, coordinates, scores.
 
 Strategy
 --------
@@ -41,7 +41,7 @@ _HALF_DIAGONAL = 0.5**0.5  # px; farthest that smoothing moves a vertex
 @dataclass(frozen=True)
 @checked
 class VectorizeOptions:
-    """How pixel lines become road geometry."""
+    """How lines of pixels become road geometry."""
 
     smoothing: NotNegative[float] = 2.0  # m, standard deviation of the smoothing along the line; 0 switches it off
     simplify_tolerance: NotNegative[float] = 1.0  # m, Douglas-Peucker; 0 keeps every vertex
@@ -69,7 +69,7 @@ def vectorize(
     probability
         Centreline probability of the same shape; its mean along an edge becomes the edge's ``score``.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -136,7 +136,7 @@ def graph_from_pixels(
 
 
 def _smoothed(pixels: PixelGraph, corner: NDArray[np.float64], sigma: float) -> NDArray[Any]:
-    """Smooth the lines, sigma in pixels; LineStrings of (row, col) from each line's own whole-pixel corner.
+    """Smooth lines with a sigma in pixels; return LineStrings of (row, col), relative to a whole pixel of each line.
 
     Passes of the kernel (1, 2, 1) / 4 with fixed ends add up to a Gaussian whose variance is half their number,
     in vertices, and leave a straight line straight up to its ends.
@@ -146,14 +146,14 @@ def _smoothed(pixels: PixelGraph, corner: NDArray[np.float64], sigma: float) -> 
     moved = local.copy()
     _diffuse(moved, pixels.offsets, round(2 * sigma**2))
     step = moved - local
-    # No vertex leaves its pixel's circle: beyond it lies shape, not stairs.
+    # No vertex moves out of the circle around its pixel: a larger change would alter the shape, not the pixel steps.
     local += step * (_HALF_DIAGONAL / np.maximum(np.hypot(*step.T), _HALF_DIAGONAL))[:, None]
     return shapely.linestrings(local, indices=line)
 
 
 @njit(cache=True)
 def _diffuse(vertices: NDArray[np.float64], offsets: NDArray[np.int64], passes: int) -> None:
-    """Replace, ``passes`` times, each inner vertex by half itself and a quarter of each vertex beside it."""
+    """Replace each inner vertex, ``passes`` times, by half of itself and a quarter of each neighbour."""
     for line in range(len(offsets) - 1):
         for _ in range(passes):
             row, col = vertices[offsets[line]]
@@ -165,14 +165,14 @@ def _diffuse(vertices: NDArray[np.float64], offsets: NDArray[np.int64], passes: 
 
 
 def _simplified(lines: NDArray[Any], loop: NDArray[np.bool_], tolerance: float) -> NDArray[Any]:
-    """Simplify with Douglas-Peucker; a loop that would fall flat is left as it is."""
+    """Simplify lines with Douglas-Peucker; a loop that would lose its area stays as it is."""
     simple = shapely.simplify(lines, tolerance, preserve_topology=False)
     flat = loop & (shapely.get_num_coordinates(simple) < 4)
     return np.where(flat, lines, simple)
 
 
 def _scores(pixels: PixelGraph, probability: NDArray[Any] | Blocks) -> NDArray[np.float64]:
-    """Mean probability at the pixels of every line, its nodes included."""
+    """Return the mean probability at the pixels of every line, including its nodes."""
     row, col = (np.rint(part).astype(np.int64) for part in (pixels.row, pixels.col))
     total = np.add.reduceat(probability[row, col].astype(np.float64), pixels.offsets[:-1])
     return total / np.diff(pixels.offsets)

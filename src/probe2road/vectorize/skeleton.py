@@ -1,4 +1,4 @@
-"""Mask to one-pixel skeleton, in one piece or window by window.
+"""From a mask to a skeleton of one pixel width, in one piece or window by window.
 
 Strategy
 --------
@@ -31,7 +31,7 @@ Method = Literal["guo_hall", "zhang_suen"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
 _NO_LIMIT = 2**62  # iterations
-# Bits of a pixel's state. What is fixed is set, too.
+# Bits of a pixel's state. A fixed pixel is set, too.
 _SET, _QUEUED_FIRST, _QUEUED_SECOND, _FIXED = np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(8)
 SET, FIXED = _SET, _SET | _FIXED
 
@@ -107,7 +107,7 @@ def skeletonize_windows(
     halo: int = 64,
     method: Method = "guo_hall",
 ) -> NDArray[np.bool_] | Blocks:
-    """Thin a mask window by window, pixel for pixel as `skeletonize` thins the whole.
+    """Thin a mask window by window; the result is the same, pixel for pixel, as `skeletonize` of the whole mask.
 
     Every window runs at most half its halo in iterations, so that what it says about its own pixels is exact.
     Where a removal still happens in the last of them the halo is doubled and all windows are done again, once
@@ -119,7 +119,7 @@ def skeletonize_windows(
         Shape ``(rows, cols)``, an array, a memory map, or blocks; it is read window by window.
     out
         Boolean array, memory map or blocks of the same shape to write to; a new array, or blocks where the mask is
-        in blocks, where it is None. It must not share memory with the mask.
+        in blocks, if it is None. It must not share memory with the mask.
     window
         Side of a window, pixels.
     halo
@@ -159,7 +159,7 @@ def skeletonize_windows(
 
 
 def thin_state(state: NDArray[np.uint8], *, method: Method = "guo_hall") -> None:
-    """Thin an image in place around pixels that stay, as skeletons do that grow level by level.
+    """Thin an image in place around fixed pixels, for skeletons that grow level by level.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def thin_state(state: NDArray[np.uint8], *, method: Method = "guo_hall") -> None
 def skeleton_pixels(
     skeleton: NDArray[Any] | Blocks, *, strip: int = 4096
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """List the rows and columns of a skeleton's pixels, sorted; a memory map is read ``strip`` rows at a time.
+    """List the rows and columns of a skeleton's pixels, sorted; a memory map is read in strips of ``strip`` rows.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def skeleton_pixels(
 def _thin_windows(
     mask: NDArray[Any] | Blocks, out: NDArray[np.bool_] | Blocks, window: int, halo: int, table: NDArray[np.bool_]
 ) -> bool:
-    """Thin all windows; False where the halo proves too small for one of them."""
+    """Thin all windows; return False if the halo is too small for one of them."""
     rows, cols = mask.shape
     if isinstance(mask, Blocks):
         corners = mask.squares(window)
@@ -243,7 +243,7 @@ def _shape_of(mask: NDArray[Any] | Blocks) -> tuple[int, int]:
 def _padded_state(
     mask: NDArray[Any] | Blocks, top: int, left: int, rows: int, cols: int, *, halo: int
 ) -> NDArray[np.uint8]:
-    """Copy a window and its halo out of a mask, with one frame of background around it."""
+    """Copy a window and its halo out of a mask, with a frame of one background pixel around it."""
     margin = halo + 1
     state = np.zeros((rows + 2 * margin, cols + 2 * margin), np.uint8)
     above, before = max(top - halo, 0), max(left - halo, 0)
@@ -255,7 +255,7 @@ def _padded_state(
 
 @cache
 def _deletion_table(method: Method) -> NDArray[np.bool_]:
-    """Answer, per sub-iteration and neighbourhood, whether the pixel goes; shape ``(2, 256)``.
+    """Return whether a pixel is deleted, for each sub-iteration and neighbourhood; shape ``(2, 256)``.
 
     Bit k of a neighbourhood is p(k + 2) of METHOD 7: clockwise from north.
     """
@@ -275,7 +275,7 @@ def _deletion_table(method: Method) -> NDArray[np.bool_]:
 
 @njit(cache=True, nogil=True)  # threads can thin several masks at once
 def _thin(state: NDArray[np.uint8], table: NDArray[np.bool_], limit: int, margin: int) -> int:
-    """Thin a padded state in place, for at most ``limit`` iterations.
+    """Thin a padded state in place, in at most ``limit`` iterations.
 
     Returns the number of the last iteration that removed a pixel more than ``margin`` from the border.
 
@@ -319,7 +319,7 @@ def _thin(state: NDArray[np.uint8], table: NDArray[np.bool_], limit: int, margin
 
 @njit(cache=True)
 def _boundary(pixels: NDArray[np.uint8], around: NDArray[np.int64]) -> NDArray[np.int64]:
-    """List the pixels with background beside them, and mark them as queued for both sub-iterations."""
+    """List the set pixels next to background, and mark them as queued for both sub-iterations."""
     found = np.flatnonzero(pixels)  # the frame is background, so that every neighbourhood lies inside
     count = 0
     for pixel in found:
@@ -349,7 +349,7 @@ def _queue_neighbours(
     size: NDArray[np.int64],
     which: int,
 ) -> NDArray[np.int64]:
-    """Queue the set neighbours of a removed pixel that are not queued yet; the queue grows where it must."""
+    """Queue the set neighbours of a removed pixel that are not queued yet; the queue grows if necessary."""
     if size[which] + 8 > len(queue):
         queue = np.append(queue, np.empty(len(queue) + 8, np.int64))
     for step in around:

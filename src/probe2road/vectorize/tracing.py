@@ -1,4 +1,4 @@
-"""Skeleton to a multigraph of pixel polylines.
+"""From a skeleton to a multigraph of pixel lines.
 
 Strategy
 --------
@@ -29,7 +29,7 @@ _REACH = 1.4143  # px; a node stands for pixels no farther than a diagonal step
 
 @dataclass(frozen=True)
 class PixelGraph:
-    """What `trace_pixels` finds: nodes, and between them lines of pixels.
+    """The result of `trace_pixels`: nodes, and lines of pixels between them.
 
     Rows and columns count from the centre of the top left pixel and may be fractional at nodes. N nodes,
     L lines, P vertices of all lines one after the other.
@@ -56,7 +56,7 @@ class PixelGraph:
 
 
 def trace_pixels(row: NDArray[np.int64], col: NDArray[np.int64]) -> PixelGraph:
-    """Trace the pixels of a skeleton into a multigraph of pixel polylines.
+    """Trace the pixels of a skeleton into a multigraph of pixel lines.
 
     Junction pixels that touch (crossing number 3 and more, and squares of 2 x 2) become one node at their
     centroid, unless they reach farther than a diagonal step from it: then each is a node. Dead ends are nodes.
@@ -130,7 +130,7 @@ def trace_pixels(row: NDArray[np.int64], col: NDArray[np.int64]) -> PixelGraph:
 
 
 def _with_line_ends(graph: PixelGraph) -> PixelGraph:
-    """Put every line's nodes before and after its pixels, and drop nodes without lines."""
+    """Add the nodes at both ends of every line to its pixels, and drop nodes without lines."""
     used = np.zeros(len(graph.node_row), bool)
     used[graph.start], used[graph.stop] = True, True
     number = np.cumsum(used) - 1
@@ -150,7 +150,7 @@ def _with_line_ends(graph: PixelGraph) -> PixelGraph:
 
 @njit(cache=True)
 def pixel_links(row: NDArray[np.int64], col: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Find, per pixel, its eight neighbours clockwise from north, -1 where there is none; shape (n, 8).
+    """Return the eight neighbours of every pixel, clockwise from north, -1 for none; shape (n, 8).
 
     One pointer runs along the row above, so that all neighbours are found in one pass over the sorted pixels.
     """
@@ -173,7 +173,7 @@ def pixel_links(row: NDArray[np.int64], col: NDArray[np.int64]) -> NDArray[np.in
 
 @njit(cache=True)
 def _kept_links(links: NDArray[np.int32]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Drop diagonal links between pixels that a third one joins; tell which pixels are junctions.
+    """Drop diagonal links between pixels that a third pixel connects; tell which pixels are junctions.
 
     What is left of the links of a pixel of a thin line is its crossing number. The pixels of a full square of
     2 x 2 count as junctions too: their links go around the square and nowhere else.
@@ -201,7 +201,7 @@ def _nodes(
     kept: NDArray[np.bool_],
     junction: NDArray[np.bool_],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Form the nodes: per pixel its node or -1, per node its centroid."""
+    """Return the node of every pixel, -1 for none, and the centroid of every node."""
     n_pixels = len(row)
     node = np.full(n_pixels, -1)
     node_row, node_col = np.empty(n_pixels), np.empty(n_pixels)
@@ -240,7 +240,7 @@ def _lines(
     node_row: NDArray[np.float64],
     node_col: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Walk the lines between nodes: start, stop, sizes and pixels of their insides, and the pixels seen.
+    """Follow the lines between nodes: return their start, stop, sizes and inner pixels, and which pixels were seen.
 
     A loop whose pixels all lie within reach of its node runs around a hole of a pixel: the node stands for it.
     """
@@ -274,7 +274,7 @@ def _lines(
 def _rings(
     links: NDArray[np.int32], kept: NDArray[np.bool_], seen: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Walk the closed lines that no node has led to: first pixels, sizes and pixels of the rest of each."""
+    """Follow the closed lines without a node: return their first pixels, and the sizes and pixels of the rest."""
     ring, sizes = np.empty(len(seen) // 4 + 1, np.int64), np.empty(len(seen) // 4 + 1, np.int64)
     path = np.empty(len(seen), np.int64)
     n_rings = filled = 0
@@ -300,7 +300,7 @@ def _walk(
     path: NDArray[np.int64],
     filled: int,
 ) -> tuple[int, int]:
-    """Follow a line to a pixel that is seen already; pixels on the way go to path from ``filled`` on.
+    """Follow a line up to a pixel that was seen before; write the pixels on the way to ``path`` from ``filled`` on.
 
     Returns how many they are, and the pixel it ends at.
     """

@@ -11,17 +11,17 @@ from probe2road.baselines.deepmg.variants import find_variant
 from probe2road.errors import OptionError
 from probe2road.fleet.contract import Fleet, fleet_from_tables
 from probe2road.raster.grid import Grid
+from sketches import UTM
 
-CRS = "EPSG:32616"
 PUBLISHED, FIXED = find_variant("as_published"), find_variant("fixed")
-GRID = Grid.from_bounds((0, 0, 79, 39), resolution=2.0, crs=CRS)  # 20 rows, 40 columns
+GRID = Grid.from_bounds((0, 0, 79, 39), resolution=2.0, crs=UTM)  # 20 rows, 40 columns
 
 
 def fleet(*traces: list[tuple[float, float, float]]) -> Fleet:
     """Return a fleet of traces given as (t, x, y)."""
     rows = [(name, *fix) for name, trace in enumerate(traces) for fix in trace]
     table = pd.DataFrame(rows, columns=["trace_id", "t", "x", "y"])
-    return fleet_from_tables(table, crs=CRS, target_crs=CRS)
+    return fleet_from_tables(table, crs=UTM, keep_crs=True)
 
 
 def steps(*traces: list[tuple[float, float, float]]) -> Steps:
@@ -77,7 +77,7 @@ def test_speed_is_the_mean_over_steps_that_start_in_the_cell() -> None:
 
 def test_speed_is_unknown_without_a_clock() -> None:
     table = pd.DataFrame({"trace_id": 0, "x": [1.0, 21.0], "y": [21.0, 21.0]})
-    planes, _ = extract_features(thin_traces(fleet_from_tables(table, crs=CRS, target_crs=CRS)), GRID, FIXED)
+    planes, _ = extract_features(thin_traces(fleet_from_tables(table, crs=UTM, keep_crs=True)), GRID, FIXED)
     assert (plane("speed", planes) == -1.0).all()
     assert plane("direction_e", planes)[9, 0] == 1.0
 

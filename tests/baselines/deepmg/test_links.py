@@ -19,7 +19,8 @@ from probe2road.baselines.deepmg.links import (
 from probe2road.baselines.deepmg.variants import find_variant
 from probe2road.errors import OptionError
 from probe2road.graph.check import check_graph
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph
+from sketches import graph_of
 
 FIXED, PUBLISHED = find_variant("fixed"), find_variant("as_published")
 CENTRAL = 500_000.0  # easting of the middle of the zone
@@ -28,7 +29,7 @@ LONG = [(0, 0), (200, 0)]
 
 def graph(*lines: Any) -> RoadGraph:
     moved = [[(x + CENTRAL, y + 4_000_000.0) for x, y in line] for line in lines]
-    return graph_from_lines(moved, crs="EPSG:32616")
+    return graph_of(*moved)
 
 
 def ends(found: list[Link], of: RoadGraph) -> list[tuple[float, float]]:

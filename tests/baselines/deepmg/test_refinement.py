@@ -5,23 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from probe2road.baselines.deepmg.features import FeatureOptions, Steps, thin_traces
 from probe2road.baselines.deepmg.pruning import PruneOptions, prune_graph
 from probe2road.baselines.deepmg.traversals import MatcherOptions, count_traversals
 from probe2road.errors import OptionError
-from probe2road.fleet.contract import fleet_from_tables
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
-
-CRS = "EPSG:32616"
+from probe2road.graph.roadgraph import RoadGraph
+from sketches import fleet_of, graph_of
 
 
 def steps(*traces: list[tuple[float, float]]) -> Steps:
-    rows = [(name, 4.0 * t, *xy) for name, trace in enumerate(traces) for t, xy in enumerate(trace)]
-    table = pd.DataFrame(rows, columns=["trace_id", "t", "x", "y"])
-    return thin_traces(fleet_from_tables(table, crs=CRS, target_crs=CRS), FeatureOptions(spacing=1.0))
+    return thin_traces(fleet_of(*traces, interval=4.0), FeatureOptions(spacing=1.0))
 
 
 def with_links(graph: RoadGraph, *links: int) -> RoadGraph:
@@ -29,7 +24,7 @@ def with_links(graph: RoadGraph, *links: int) -> RoadGraph:
     return replace(graph, edges=graph.edges.assign(origin=origin))
 
 
-CHAIN = graph_from_lines([[(0, 0), (50, 0)], [(50, 0), (100, 0)], [(100, 0), (150, 0)]], crs=CRS)
+CHAIN = graph_of([(0, 0), (50, 0)], [(50, 0), (100, 0)], [(100, 0), (150, 0)])
 
 
 def test_each_direction_is_counted_on_its_own() -> None:
@@ -55,7 +50,7 @@ def test_a_stretch_off_the_network_breaks_the_trace() -> None:
 
 def test_a_fix_cannot_go_back_on_its_edge() -> None:
     """The way on is by the other direction, around the end of the edge: twice as many traversals, all by noise."""
-    lonely = graph_from_lines([[(0, 0), (50, 0)]], crs=CRS)
+    lonely = graph_of([(0, 0), (50, 0)])
     assert count_traversals(steps([(10.0, 0.0), (30.0, 0.0)]), lonely).tolist() == [[1, 0]]
     assert count_traversals(steps([(10.0, 0.0), (42.0, 0.0), (40.0, 0.0)]), lonely).tolist() == [[1, 1]]
 
@@ -65,13 +60,13 @@ def test_a_link_counts_for_more_than_its_length(height: float, by_link: bool) ->
     """A link of 80 m counts for 112 m. The way round has 98 m, which is shorter than that, or 120 m."""
     way_round = [(10, 0), (50, height), (90, 0)]
     lines = [[(-40, 0), (10, 0)], [(90, 0), (140, 0)], [(10, 0), (90, 0)], way_round]
-    graph = with_links(graph_from_lines(lines, crs=CRS), 2)
+    graph = with_links(graph_of(*lines), 2)
     counts = count_traversals(steps([(-30.0, 0.0), (0.0, 0.0), (100.0, 0.0), (130.0, 0.0)]), graph)
     assert counts.tolist() == [[1, 0], [1, 0], [int(by_link), 0], [int(not by_link), 0]]
 
 
 def test_no_edges_give_no_counts() -> None:
-    assert count_traversals(steps([(0.0, 0.0), (9.0, 0.0)]), graph_from_lines([], crs=CRS)).shape == (0, 2)
+    assert count_traversals(steps([(0.0, 0.0), (9.0, 0.0)]), graph_of()).shape == (0, 2)
 
 
 def test_undriven_edges_and_rarely_driven_links_go() -> None:
@@ -87,14 +82,14 @@ def test_undriven_edges_and_rarely_driven_links_go() -> None:
 
 def test_the_two_shortest_links_of_a_node_stay() -> None:
     spokes = [[(0, 0), (30, 0)], [(0, 0), (0, 20)], [(0, 0), (-40, 0)], [(0, 0), (0, -90)]]
-    graph = with_links(graph_from_lines(spokes, crs=CRS), 0, 1, 2)
+    graph = with_links(graph_of(*spokes), 0, 1, 2)
     pruned = prune_graph(graph, np.full((4, 2), 9))
     assert pruned.edges["length"].tolist() == [30.0, 20.0, 90.0]
 
 
 def test_links_that_go_anyway_take_no_room() -> None:
     spokes = [[(0, 0), (30, 0)], [(0, 0), (0, 20)], [(0, 0), (-40, 0)]]
-    graph = with_links(graph_from_lines(spokes, crs=CRS), 0, 1, 2)
+    graph = with_links(graph_of(*spokes), 0, 1, 2)
     assert prune_graph(graph, np.array([[9, 9], [0, 0], [9, 9]])).edges["length"].tolist() == [30.0, 40.0]
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import shapely
 
@@ -18,31 +17,25 @@ from probe2road.baselines.deepmg.t2rnet import T2RNet, soft_dice_loss, t2rnet_lo
 from probe2road.baselines.deepmg.tiles import TileSet, open_tiles, read_batch, tile_grids, write_tiles  # noqa: E402
 from probe2road.baselines.deepmg.training import TrainOptions, train  # noqa: E402
 from probe2road.errors import InputError, OptionError  # noqa: E402
-from probe2road.fleet.contract import Fleet, fleet_from_tables  # noqa: E402
+from probe2road.fleet.contract import Fleet  # noqa: E402
 from probe2road.graph.check import check_graph  # noqa: E402
-from probe2road.graph.roadgraph import graph_from_lines  # noqa: E402
 from probe2road.raster.counts import fleet_grid  # noqa: E402
+from sketches import UTM, fleet_of, graph_of, spaced  # noqa: E402
 
-CRS = "EPSG:32616"
 QUICK = TrainOptions(width=2, epochs=2, learning_rate=0.01, validate_every=1)
 
 
 @pytest.fixture(scope="module")
 def drives() -> Fleet:
     """Two streets of 1 km that cross, driven five times each."""
-    along = np.arange(12.0, 1000.0, 12.0)
-    ways = [np.stack([along, np.full(len(along), 300.0)], 1), np.stack([np.full(len(along), 500.0), along], 1)]
-    tables = [
-        pd.DataFrame({"trace_id": name, "t": np.arange(len(along)) * 0.8, "x": way[:, 0], "y": way[:, 1]})
-        for name, way in enumerate(ways * 5)
-    ]
-    return fleet_from_tables(pd.concat(tables), crs=CRS, target_crs=CRS)
+    ways = [spaced((12, 300), (1000, 300), spacing=12.0), spaced((500, 12), (500, 1000), spacing=12.0)]
+    return fleet_of(*ways * 5, interval=0.8)
 
 
 @pytest.fixture(scope="module")
 def tiles(drives: Fleet, tmp_path_factory: pytest.TempPathFactory) -> TileSet:
-    roads = graph_from_lines([[(0, 300), (1000, 300)], [(500, 0), (500, 1000)]], crs=CRS)
-    south_west = tile_grids([shapely.box(0, 0, 1000, 1000)], resolution=2.0, crs=CRS)[2:3]
+    roads = graph_of([(0, 300), (1000, 300)], [(500, 0), (500, 1000)])
+    south_west = tile_grids([shapely.box(0, 0, 1000, 1000)], resolution=2.0, crs=UTM)[2:3]
     folder = tmp_path_factory.mktemp("tiles") / "train"
     return write_tiles(folder, thin_traces(drives), roads, south_west, variant="fixed", features=FeatureOptions())
 
@@ -91,8 +84,8 @@ def test_tiles_hold_features_and_labels(tiles: TileSet) -> None:
 
 
 def test_tiles_without_a_fix_are_left_out(drives: Fleet, tmp_path: Path) -> None:
-    grids = tile_grids([shapely.box(5000, 0, 6000, 1000)], resolution=2.0, crs=CRS)
-    roads = graph_from_lines([[(0, 300), (1000, 300)]], crs=CRS)
+    grids = tile_grids([shapely.box(5000, 0, 6000, 1000)], resolution=2.0, crs=UTM)
+    roads = graph_of([(0, 300), (1000, 300)])
     made = write_tiles(tmp_path / "t", thin_traces(drives), roads, grids, variant="fixed", features=FeatureOptions())
     assert made.count == 0
     with pytest.raises(InputError, match="there are none"):

@@ -5,15 +5,14 @@ import shapely
 
 from probe2road.benchmark.tables.counts import geo_counts, itopo_counts, soft_counts
 from probe2road.benchmark.tables.intervals import COUNTS, difference_interval, f1_interval
-from probe2road.graph.roadgraph import graph_from_lines
 from probe2road.metrics.geo import GeoOptions, geo_networks
 from probe2road.metrics.itopo import ItopoOptions, itopo_networks
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.soft_f1 import soft_f1
+from probe2road.raster.drawing import label_mask
 from probe2road.raster.grid import Grid
-from probe2road.raster.lines import label_mask
+from sketches import UTM, graph_of
 
-CRS = "EPSG:32616"
 STREETS = [[(x, 100.0), (x, 2700.0)] for x in np.arange(300.0, 2700.0, 400.0)]
 CROSSINGS = [[(x, y), (x + 400.0, y)] for x in np.arange(300.0, 2200.0, 400.0) for y in (600.0, 1500.0)]
 
@@ -21,7 +20,7 @@ CROSSINGS = [[(x, y), (x + 400.0, y)] for x in np.arange(300.0, 2200.0, 400.0) f
 def split_at_crossings(lines):
     """The street grid with a node at every crossing."""
     union = shapely.union_all([shapely.LineString(line) for line in lines])
-    return graph_from_lines([part.coords for part in union.geoms], crs=CRS)
+    return graph_of(*(part.coords for part in union.geoms))
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +48,8 @@ def test_the_counts_of_all_tiles_are_those_of_the_score(networks, counts, score)
 
 
 def test_pixels_are_counted_in_the_tiles_of_the_crs():
-    grid = Grid.from_bounds((850.0, 930.0, 1300.0, 1200.0), crs=CRS)
-    reference = graph_from_lines([[(860.0, 940.0), (1250.0, 1150.0)]], crs=CRS)
+    grid = Grid.from_bounds((850.0, 930.0, 1300.0, 1200.0), crs=UTM)
+    reference = graph_of([(860.0, 940.0), (1250.0, 1150.0)])
     mask = np.roll(label_mask(reference, grid, width=3), 1, axis=1)
     tiles = soft_counts(mask, grid, reference, width=3)
     assert sorted(tiles.index) == ["0_0", "0_1", "1_1"]
@@ -61,8 +60,8 @@ def test_pixels_are_counted_in_the_tiles_of_the_crs():
 
 
 def test_pixels_outside_an_area_do_not_count():
-    grid = Grid.from_bounds((0.0, 0.0, 100.0, 50.0), crs=CRS)
-    reference = graph_from_lines([[(5.5, 20.5), (95.5, 20.5)]], crs=CRS)
+    grid = Grid.from_bounds((0.0, 0.0, 100.0, 50.0), crs=UTM)
+    reference = graph_of([(5.5, 20.5), (95.5, 20.5)])
     area = shapely.box(0.0, 0.0, 50.0, 50.0)
     tiles = soft_counts(label_mask(reference, grid), grid, reference, width=1, area=area)
     assert tiles["reference"].tolist() == [2 * 46]  # 45 pixels and one of dilation, two rows of them

@@ -11,16 +11,11 @@ import shapely
 
 from probe2road.errors import OptionError
 from probe2road.graph.check import check_graph
-from probe2road.graph.roadgraph import RoadGraph, empty_graph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.graph.splitting import split_edges
 from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, fill_jumps, gap_weights, prune_gaps
 from probe2road.refinement.gaps.stems import facing_stems
-
-UTM = "EPSG:32616"
-
-
-def graph_of(*lines: Sequence[tuple[float, ...]]) -> RoadGraph:
-    return graph_from_lines(list(lines), crs=UTM)
+from sketches import UTM, graph_of
 
 
 def links(graph: RoadGraph, **options: Any) -> list[list[tuple[float, float]]]:

@@ -8,10 +8,10 @@ import pytest
 import shapely
 
 from probe2road.errors import InputError, OptionError
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.refinement.junctions.braids import BraidOptions, open_braids
+from sketches import graph_of
 
-CRS = "EPSG:32616"
 Way = list[tuple[int, bool]]  # edges and whether they are driven forwards
 
 # Two carriageways 7 m apart with three joints: a lens of 60 m, and a line of 40 m behind it.
@@ -49,7 +49,7 @@ def roads(graph: RoadGraph) -> list[shapely.LineString]:
 
 @pytest.mark.parametrize("bend", [0.0, 4e-4])
 def test_two_carriageways_come_apart_whatever_was_matched_between(bend: float) -> None:
-    graph = graph_from_lines(bent(BRAID, bend), crs=CRS)
+    graph = graph_of(*bent(BRAID, bend))
     opened = open_braids(graph, driven(*EASTWARDS, *WESTWARDS))
     assert len(opened.edges) == 2
     assert opened.degrees().tolist() == [1, 1, 1, 1]
@@ -62,7 +62,7 @@ def test_two_carriageways_come_apart_whatever_was_matched_between(bend: float) -
 def test_one_road_stays_one_line() -> None:
     lines = [[(-200, 0), (-30, 0)], [(-30, 0), (0, 3), (30, 0)], [(-30, 0), (0, -3), (30, 0)], [(30, 0), (200, 0)]]
     ways: list[Way] = [[(0, True), (k, True), (3, True)] for k in (1, 1, 2, 2)]
-    opened = open_braids(graph_from_lines(lines, crs=CRS), driven(*ways))
+    opened = open_braids(graph_of(*lines), driven(*ways))
     (line,) = opened.edges.geometry
     assert line.hausdorff_distance(shapely.LineString([(-200, 0), (200, 0)])) < 1.0
 
@@ -76,12 +76,12 @@ def test_one_road_stays_one_line() -> None:
     ],
 )
 def test_what_traces_do_not_prove_stays(case: str, ways: list[Way]) -> None:
-    graph = graph_from_lines(BRAID, crs=CRS)
+    graph = graph_of(*BRAID)
     assert open_braids(graph, driven(*ways)) is graph, case
 
 
 def test_a_ramp_that_leaves_at_a_joint_keeps_it_closed() -> None:
-    graph = graph_from_lines([*BRAID, [(10, 0), (60, 20), (200, 60)]], crs=CRS)
+    graph = graph_of(*BRAID, [(10, 0), (60, 20), (200, 60)])
     ramp: list[Way] = 4 * [[(1, True), (2, True), (7, True)]]
     assert open_braids(graph, driven(*EASTWARDS, *WESTWARDS, *ramp)) is graph
 
@@ -90,20 +90,20 @@ def test_roads_far_apart_are_none(subtests: Any) -> None:
     wide = [[(x, 3.0 * y) for x, y in line] for line in BRAID]
     for lines, options in ((wide, None), (BRAID, BraidOptions(max_inner=0)), (BRAID, BraidOptions(max_inner=30))):
         with subtests.test(options=options):
-            graph = graph_from_lines(lines, crs=CRS)
+            graph = graph_of(*lines)
             assert open_braids(graph, driven(*EASTWARDS, *WESTWARDS), options=options) is graph
 
 
 def test_a_long_stretch_counts_where_both_directions_share_it() -> None:
     longer = [[(x + 150 if x > 20 else x, y) for x, y in line] for line in BRAID]
-    graph, steps = graph_from_lines(longer, crs=CRS), driven(*EASTWARDS, *WESTWARDS)
+    graph, steps = graph_of(*longer), driven(*EASTWARDS, *WESTWARDS)
     assert len(open_braids(graph, steps).edges) == 2
     assert open_braids(graph, steps, options=BraidOptions(max_shared=100.0)) is graph
 
 
 def test_all_else_keeps_its_ids_and_lines() -> None:
     crossing = [[(-300, 500), (0, 520)], [(0, 520), (300, 500)], [(0, 520), (0, 700)]]
-    graph = graph_from_lines([*crossing, *BRAID], crs=CRS)
+    graph = graph_of(*crossing, *BRAID)
     ways = [[(edge + 3, forward) for edge, forward in way] for way in (*EASTWARDS, *WESTWARDS)]
     opened = open_braids(graph, driven(*ways))
     assert opened.edges.index[:3].tolist() == [0, 1, 2]
@@ -116,18 +116,16 @@ def test_the_order_of_edges_does_not_matter() -> None:
     ways = [*EASTWARDS, *WESTWARDS]
     order = np.random.default_rng(3).permutation(len(BRAID))
     place = np.argsort(order)
-    mixed = graph_from_lines([BRAID[k] for k in order], crs=CRS)
+    mixed = graph_of(*(BRAID[k] for k in order))
     steps = driven(*[[(int(place[edge]), forward) for edge, forward in way] for way in ways])
-    one, other = (
-        roads(open_braids(*given)) for given in ((graph_from_lines(BRAID, crs=CRS), driven(*ways)), (mixed, steps))
-    )
+    one, other = (roads(open_braids(*given)) for given in ((graph_of(*BRAID), driven(*ways)), (mixed, steps)))
     for line, same in zip(one, other, strict=True):
         assert line.normalize().equals_exact(same.normalize(), 1e-6)
 
 
 def test_steps_of_another_graph_are_refused() -> None:
     with pytest.raises(InputError, match="edge 99 of the matches"):
-        open_braids(graph_from_lines(BRAID, crs=CRS), driven([(99, True)]))
+        open_braids(graph_of(*BRAID), driven([(99, True)]))
 
 
 def test_negative_numbers_are_refused() -> None:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,18 +9,14 @@ import pytest
 from probe2road.errors import InputError, OptionError
 from probe2road.fleet.contract import fleet_from_tables
 from probe2road.graph.check import check_graph
-from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
+from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.match import match
 from probe2road.refinement.junctions.passages import node_passages, passing_positions
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
+from sketches import UTM, fleet_of, graph_of, spaced
 
-UTM = "EPSG:32616"
 NOT_MERGED = DisambiguateOptions(merge=False)
 LITERAL = DisambiguateOptions(variant="literal", merge=False)
-
-
-def graph_of(*lines: Sequence[tuple[float, ...]]) -> RoadGraph:
-    return graph_from_lines(list(lines), crs=UTM)
 
 
 #      3
@@ -270,21 +265,17 @@ class TestPositions:
         x = np.arange(-80.0, 81.0, 20)
         east = pd.DataFrame({"trace_id": "a", "t": range(9), "x": x, "y": 0.0, "z": 10 + x / 10})
         for table, expected in ((east, [0.0, 0.0, 10.0]), (east.drop(columns="t"), [np.nan] * 3)):
-            fleet = fleet_from_tables(table, crs=UTM, target_crs=UTM)
+            fleet = fleet_from_tables(table, crs=UTM, keep_crs=True)
             found = passing_positions(CROSS, fleet, match(CROSS, fleet))
             assert found["via_node"].tolist() == [1]
             assert found[["x", "y", "z"]].to_numpy()[0] == pytest.approx(expected, abs=1e-6, nan_ok=True)
 
     def test_far_fixes_say_nothing(self) -> None:
-        table = pd.DataFrame({"trace_id": 1, "t": [0, 4], "x": [-80.0, 80.0], "y": 0.0, "z": 5.0})
-        fleet = fleet_from_tables(table, crs=UTM, target_crs=UTM)
+        fleet = fleet_of([(-80.0, 0.0, 5.0), (80.0, 0.0, 5.0)], interval=4.0)
         assert passing_positions(CROSS, fleet, match(CROSS, fleet))["z"].isna().all()
 
     def test_other_graph(self) -> None:
-        fleet = fleet_from_tables(
-            pd.DataFrame({"trace_id": 1, "t": range(9), "x": np.arange(-80.0, 81.0, 20), "y": 0.0}),
-            crs=UTM, target_crs=UTM,
-        )  # fmt: skip
+        fleet = fleet_of(spaced((-80, 0), (80, 0), spacing=20.0))
         matches = match(CROSS, fleet)
         other = graph_of([(0, 0), (90, 0)])
         with pytest.raises(InputError, match="nodes that are not in the graph"):

@@ -14,8 +14,8 @@ from probe2road.simulation.driving.routes import DemandModel, draw_route, link_g
 from probe2road.simulation.driving.speeds import DriverModel, drive_along, lane_wander
 from probe2road.simulation.driving.traffic import drive, traffic_world
 from probe2road.simulation.networks.network import network_from_sections
+from sketches import UTM
 
-CRS = "EPSG:32616"
 DEMAND = DemandModel(min_trip_time=1.0)
 STEADY = DriverModel(lane_bias=0.0, wander_sigma=0.0, signal_stop=0.0, yield_stop=0.0)
 
@@ -23,14 +23,14 @@ STEADY = DriverModel(lane_bias=0.0, wander_sigma=0.0, signal_stop=0.0, yield_sto
 def crossing(**columns):
     """A four-armed junction of two-way streets at the origin, arms of 300 m: east, north, west, south."""
     arms = [[(0, 0), (300, 0)], [(0, 0), (0, 300)], [(0, 0), (-300, 0)], [(0, 0), (0, -300)]]
-    return network_from_sections(arms, crs=CRS, highway="secondary", lanes_backward=1, lane_width=3.5, **columns)
+    return network_from_sections(arms, crs=UTM, highway="secondary", lanes_backward=1, lane_width=3.5, **columns)
 
 
 def motorway_with_exit():
     """Three lanes eastbound; a ramp leaves to the right at 2 km."""
     lines = [[(0, 0), (2000, 0)], [(2000, 0), (4000, 0)], [(2000, 0), (2300, -30), (2600, -150)]]
     highway = ["motorway", "motorway", "motorway_link"]
-    return network_from_sections(lines, crs=CRS, highway=highway, lanes_forward=[3, 3, 1])
+    return network_from_sections(lines, crs=UTM, highway=highway, lanes_forward=[3, 3, 1])
 
 
 def drives(network, n, *, driver=STEADY, demand=DEMAND):
@@ -112,7 +112,7 @@ def test_lane_choice_reaches_the_exit_lane_within_the_link_before():
 def test_demand_has_a_heavy_tail():
     grid = [[(x, y), (x + 200, y)] for x in range(0, 1000, 200) for y in range(0, 1001, 200)]
     grid += [[(y, x), (y, x + 200)] for x in range(0, 1000, 200) for y in range(0, 1001, 200)]
-    network = network_from_sections(grid, crs=CRS, highway="secondary", lanes_backward=1)
+    network = network_from_sections(grid, crs=UTM, highway="secondary", lanes_backward=1)
     demand = DemandModel(min_trip_time=20.0)
     graph = link_graph(network, demand, rng=np.random.default_rng(5))
     counts = np.zeros(graph.n)
@@ -162,14 +162,14 @@ def test_wander_has_the_spread_and_smoothness_asked_for():
 
 def test_heights_follow_the_road():
     line = [(0, 0, 0.0), (1000, 0, 40.0), (2000, 0, 0.0)]
-    _, made = drives(network_from_sections([line], crs=CRS), 1)
+    _, made = drives(network_from_sections([line], crs=UTM), 1)
     expected = np.interp(made[0].xyz[:, 0], [0, 1000, 2000], [0, 40, 0])
     assert np.abs(made[0].xyz[:, 2] - expected).max() < 0.15
 
 
 def test_an_empty_network_and_impossible_models_are_refused():
     with pytest.raises(InputError, match="no section"):
-        traffic_world(network_from_sections([], crs=CRS), DEMAND, rng=np.random.default_rng(0))
+        traffic_world(network_from_sections([], crs=UTM), DEMAND, rng=np.random.default_rng(0))
     with pytest.raises(OptionError, match="mean_trip_time"):
         DemandModel(mean_trip_time=0.0)
     with pytest.raises(OptionError, match="acceleration"):

@@ -13,8 +13,8 @@ from probe2road.simulation.networks.network import RoadNetwork, network_from_sec
 from probe2road.simulation.networks.osm import read_network
 from probe2road.simulation.networks.profile import ProfileOptions
 from probe2road.simulation.networks.terrain import Terrain
+from sketches import UTM
 
-CRS = "EPSG:32616"
 DATA = Path(os.environ.get("PROBE2ROAD_DATA", Path(__file__).parents[4] / "shared" / "data")) / "osm"
 
 EAST = [(-800, 0), (800, 0)]
@@ -22,7 +22,7 @@ NORTH = [(0, -800), (0, 800)]
 
 
 def solve(lines, **columns) -> RoadNetwork:
-    return solve_heights(network_from_sections(lines, crs=CRS, **columns), rng=np.random.default_rng(3))
+    return solve_heights(network_from_sections(lines, crs=UTM, **columns), rng=np.random.default_rng(3))
 
 
 @pytest.mark.parametrize(
@@ -67,19 +67,19 @@ def test_stacked_roads_without_a_crossing_point():
 def test_roads_that_part_are_not_stacked():
     # The ramp is tagged as a bridge from the node on, but cannot be 5.5 m up where it leaves.
     lines = [[(-800, 0), (0, 0)], [(0, 0), (800, 0)], [(0, 0), (90, -5), (600, -220)]]
-    network = network_from_sections(lines, crs=CRS, layer=[0, 0, 1], bridge=[False, False, True])
+    network = network_from_sections(lines, crs=UTM, layer=[0, 0, 1], bridge=[False, False, True])
     assert len(find_crossings(network).table) == 0
 
 
 def test_twin_bridges_are_not_stacked_on_each_other():
     lines = [[(x, y), (x + 300, y)] for y in (0, 7) for x in (0, 300, 600)]
-    network = network_from_sections(lines, crs=CRS, layer=[0, 1, 0] * 2, bridge=[False, True, False] * 2)
+    network = network_from_sections(lines, crs=UTM, layer=[0, 1, 0] * 2, bridge=[False, True, False] * 2)
     assert len(find_crossings(network).table) == 0
 
 
 def test_roads_that_meet_do_not_cross():
     lines = [[(-99, 0), (0, 0)], [(0, 0), (99, 0)], [(0, 99), (0, 0)], [(0, 0), (0, -99)]]
-    assert len(find_crossings(network_from_sections(lines, crs=CRS)).table) == 0
+    assert len(find_crossings(network_from_sections(lines, crs=UTM)).table) == 0
 
 
 def test_a_bridge_that_is_too_short_gives_up_its_grade_and_says_so():
@@ -114,13 +114,13 @@ def test_same_seed_same_heights():
 
 
 def test_options_set_clearance_and_relief():
-    network = network_from_sections([EAST, NORTH], crs=CRS, layer=[0, 1])
+    network = network_from_sections([EAST, NORTH], crs=UTM, layer=[0, 1])
     options = ProfileOptions(clearance=8.0, terrain_relief=0.0)
     solved = solve_heights(network, rng=np.random.default_rng(0), options=options)
     report = check_heights(solved, options=options)
     assert 8.0 <= report.crossings["clearance"].min() < 8.5
     flat = solve_heights(
-        network_from_sections([EAST], crs=CRS), rng=np.random.default_rng(0), options=ProfileOptions(terrain_relief=0.0)
+        network_from_sections([EAST], crs=UTM), rng=np.random.default_rng(0), options=ProfileOptions(terrain_relief=0.0)
     )
     assert np.ptp(flat.vertices()[0][:, 2]) < 1e-6
 

@@ -12,8 +12,7 @@ from probe2road.errors import CRSError, InputError, OptionError
 from probe2road.graph.check import check_graph
 from probe2road.simulation.networks.network import check_network, network_from_sections
 from probe2road.simulation.networks.osm import read_network
-
-CRS = "EPSG:32616"
+from sketches import UTM
 
 
 def osm_file(path: Path, nodes: dict[int, tuple[float, float]], ways: list[tuple], relations: str = "") -> Path:
@@ -170,7 +169,7 @@ def test_movements_leave_out_the_way_back():
     #      |
     # 0 -- 1 -- 3      all two-way
     lines = [[(-99, 0), (0, 0)], [(0, 99), (0, 0)], [(0, 0), (99, 0)]]
-    network = network_from_sections(lines, crs=CRS, highway="primary", lanes_backward=1)
+    network = network_from_sections(lines, crs=UTM, highway="primary", lanes_backward=1)
     moves = network.movements()
     assert len(moves) == 6
     assert not (moves["from_section"] == moves["to_section"]).any()
@@ -180,13 +179,13 @@ def test_movements_leave_out_the_way_back():
 
 def test_a_loop_may_be_driven_around():
     square = [(0, 0), (90, 0), (90, 90), (0, 90), (0, 0)]
-    moves = network_from_sections([square], crs=CRS, lanes_backward=1).movements()
+    moves = network_from_sections([square], crs=UTM, lanes_backward=1).movements()
     assert moves[["from_direction", "to_direction"]].to_numpy().tolist() == [[-1, -1], [1, 1]]
 
 
 def test_reference_graph_keeps_heights_and_structure():
     lines = [[(0, 0, 5), (90, 0, 7)], [(90, 0, 7), (180, 0, 9)]]
-    network = network_from_sections(lines, crs=CRS, bridge=[False, True], layer=[0, 1])
+    network = network_from_sections(lines, crs=UTM, bridge=[False, True], layer=[0, 1])
     graph = network.reference_graph()
     check_graph(graph)
     assert graph.edges["bridge"].tolist() == [False, True]
@@ -196,14 +195,14 @@ def test_reference_graph_keeps_heights_and_structure():
 
 def test_inputs_are_not_mutated_and_ends_meet():
     lines = [[(0, 0, 1.0), (90, 0, 1.0)], [(90.004, 0, 3.0), (180, 0, 3.0)]]
-    network = network_from_sections(lines, crs=CRS)
+    network = network_from_sections(lines, crs=UTM)
     check_network(network)
     xyz, offsets = network.vertices()
     assert xyz[offsets[1] - 1].tolist() == xyz[offsets[1]].tolist() == [90, 0, 1.0]
 
 
 def test_faults_are_reported_together():
-    network = network_from_sections([[(0, 0), (90, 0)]], crs=CRS)
+    network = network_from_sections([[(0, 0), (90, 0)]], crs=UTM)
     network.sections["lanes_forward"] = 0
     network.sections["speed_limit"] = np.nan
     with pytest.raises(InputError, match=r"2 faults(.|\n)*no forward lane(.|\n)*no positive speed"):
@@ -212,10 +211,10 @@ def test_faults_are_reported_together():
 
 def test_bad_options_are_refused():
     with pytest.raises(OptionError, match="driving side 'middle'"):
-        network_from_sections([[(0, 0), (90, 0)]], crs=CRS, driving_side="middle")
+        network_from_sections([[(0, 0), (90, 0)]], crs=UTM, driving_side="middle")
     with pytest.raises(OptionError, match="highway class 'path'"):
-        network_from_sections([[(0, 0), (90, 0)]], crs=CRS, highway="path")
+        network_from_sections([[(0, 0), (90, 0)]], crs=UTM, highway="path")
     with pytest.raises(OptionError, match="country 'XX'"):
-        network_from_sections([[(0, 0), (90, 0)]], crs=CRS, markings="XX")
+        network_from_sections([[(0, 0), (90, 0)]], crs=UTM, markings="XX")
     with pytest.raises(CRSError, match="degrees"):
         network_from_sections([[(0, 0), (1, 0)]], crs="EPSG:4326")

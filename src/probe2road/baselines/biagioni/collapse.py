@@ -1,4 +1,4 @@
-"""Short segments collapsed where the trips allow it: the topology refinement of Biagioni and Eriksson.
+"""Collapse of short segments where the trips allow it: the topology refinement of Biagioni and Eriksson.
 
 Strategy
 --------
@@ -31,7 +31,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass
 class _Plan:
-    """A map while it changes; one entry per segment, and per node the segments that end there."""
+    """A map during its changes; one entry for each segment and, for each node, the segments that end there."""
 
     u: list[int]
     v: list[int]
@@ -41,7 +41,7 @@ class _Plan:
 
 
 def collapse_segments(graph: RoadGraph, runs: Runs, *, max_length: float, max_error: float) -> RoadGraph:
-    """Collapse short segments to points wherever all runs stay close to the map.
+    """Collapse short segments to points if all runs stay close to the map.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def run_errors(runs: Runs, chosen: NDArray[np.int64], lines: list[NDArray[np.flo
 
 
 def _open(graph: RoadGraph) -> _Plan:
-    """Take a map apart."""
+    """Return a map in the form in which it can be changed."""
     u, v = graph.end_rows.T.tolist()
     at_node: list[set[int]] = [set() for _ in graph.nodes.index]
     for segment, nodes in enumerate(zip(u, v, strict=True)):
@@ -125,7 +125,7 @@ def _open(graph: RoadGraph) -> _Plan:
 
 
 def _moved_lines(plan: _Plan, segment: int, touched: set[int]) -> dict[int, NDArray[np.float64]]:
-    """Lead all touched segments but one to the middle between the ends of that one."""
+    """Connect all touched segments except one to the middle between the ends of that one."""
     nodes = plan.u[segment], plan.v[segment]
     middle = (plan.lines[segment][0] + plan.lines[segment][-1]) / 2.0
     moved = {}
@@ -140,7 +140,7 @@ def _moved_lines(plan: _Plan, segment: int, touched: set[int]) -> dict[int, NDAr
 
 
 def _collapse(plan: _Plan, segment: int, moved: dict[int, NDArray[np.float64]]) -> None:
-    """Let one node stand for both ends of a segment, and end the other segments there."""
+    """Replace both end nodes of a segment by one of them, and connect the other segments to it."""
     kept, lost = plan.u[segment], plan.v[segment]
     plan.at_node[kept], plan.at_node[lost] = set(moved), set()
     for other, line in moved.items():
@@ -151,7 +151,7 @@ def _collapse(plan: _Plan, segment: int, moved: dict[int, NDArray[np.float64]]) 
 
 
 def _closed(graph: RoadGraph, plan: _Plan, collapsed: list[int]) -> RoadGraph:
-    """Put a map together again, without segments that are a point now."""
+    """Return the changed map as a graph, without the segments that have become points."""
     kept = np.setdiff1d(np.flatnonzero(np.array(plan.length) > 0), collapsed)
     u, v = np.array(plan.u, np.int64)[kept], np.array(plan.v, np.int64)[kept]
     lines = [plan.lines[segment] for segment in kept]
@@ -173,7 +173,7 @@ def _errors(
     start: NDArray[np.float64],
     stop: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Root mean square distance of chosen runs from the nearest of the straight pieces from start to stop."""
+    """Return the root mean square distance of chosen runs from the nearest straight piece between start and stop."""
     errors = np.zeros(len(chosen))
     for place in range(len(chosen)):
         first, last = offsets[chosen[place]], offsets[chosen[place] + 1]

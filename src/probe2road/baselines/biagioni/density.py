@@ -1,4 +1,4 @@
-"""Traces to the density that Biagioni and Eriksson thin: blurred lines, closed, as ranks of its levels.
+"""From traces to the density that Biagioni and Eriksson thin: blurred lines, closed, as ranks of density levels.
 
 Strategy
 --------
@@ -32,7 +32,7 @@ _WINDOW = 1024  # pixels; side of the windows that are blurred one at a time
 
 
 def trip_lines(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -> NDArray[np.int32]:
-    """Sum the trips' lines: each is anti-aliased, one pixel wide, of value 32, and counts once per pixel.
+    """Sum the lines of trips: each is anti-aliased, one pixel wide, has the value 32, and counts once per pixel.
 
     Lines run between the centres of the fixes' pixels, as those of OpenCV do unless told otherwise. What lies outside
     the grid is left out.
@@ -74,7 +74,7 @@ def blur_kernel(sigma: float, half_width: int) -> NDArray[np.float64]:
 
 
 def blur(lines: NDArray[Any], kernel: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Blur lines in both directions; outside is empty.
+    """Blur lines in both directions; pixels outside count as empty.
 
     Examples
     --------
@@ -90,7 +90,7 @@ def blur(lines: NDArray[Any], kernel: NDArray[np.float64]) -> NDArray[np.float32
 
 
 def close_with_disk(values: NDArray[Any], radius: int) -> NDArray[Any]:
-    """Close a grey image with a disk (pixels): pits that the disk does not fit into are filled to their rim.
+    """Close a grey image with a disk (radius in pixels): pits smaller than the disk are filled up to their rim.
 
     Examples
     --------
@@ -103,7 +103,7 @@ def close_with_disk(values: NDArray[Any], radius: int) -> NDArray[Any]:
 def level_ranks(
     fleet: Fleet, grid: Grid, kernel: NDArray[np.float64], *, closing: int, gaps: TraceGaps | None = None
 ) -> NDArray[np.uint8]:
-    """Draw all trips, blur, round, close with a disk, and rank by the levels.
+    """Draw all trips, blur and round the result, close it with a disk, and return the rank of its density levels.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def level_ranks(
 
 
 def _segments(fleet: Fleet, grid: Grid, gaps: TraceGaps | None) -> NDArray[np.int64]:
-    """List trip, row and column of the start, and row and column of the end of all segments; shape ``(5, S)``."""
+    """Return the trip, the row and column of the start, and those of the end of all segments; shape ``(5, S)``."""
     row, col = grid.rowcol(fleet.traces["x"], fleet.traces["y"])
     end = np.flatnonzero(~trace_breaks(fleet, gaps))
     return np.stack([fleet.owner[end], row[end - 1], col[end - 1], row[end], col[end]])
@@ -156,7 +156,7 @@ def _drawn(segments: NDArray[np.int64], window: Window) -> NDArray[np.int32]:
 
 
 def _dilated(values: NDArray[Any], radius: int) -> NDArray[Any]:
-    """Return the maximum over a disk around every pixel: over rows first, whose length depends on the row."""
+    """Return the maximum over a disk around every pixel, computed along rows first."""
     height = np.arange(-radius, radius + 1)
     half_width = np.floor(np.sqrt(radius**2 - height**2)).astype(int)
     padded = np.pad(values, ((radius, radius), (0, 0)), mode="edge")
@@ -178,7 +178,7 @@ def _draw_trips(
     scratch: NDArray[np.uint8],
     total: NDArray[np.int32],
 ) -> None:
-    """Draw trip after trip into the scratch image (all zero before and after) and add each to the total."""
+    """Draw each trip into the scratch image (all zero before and after), and add it to the total."""
     cols = scratch.shape[1]
     touched = [0 for _ in range(0)]
     for segment in range(len(trip)):
@@ -194,7 +194,7 @@ def _draw_trips(
 
 @njit(cache=True)
 def _draw_segment(r0: int, c0: int, r1: int, c1: int, scratch: NDArray[np.uint8], touched: list[int]) -> None:
-    """Raise the pixels less than one pixel from a segment to 32 times one minus their distance; list new ones."""
+    """Set pixels within one pixel of a segment to at least 32 times one minus their distance; list new pixels."""
     rows, cols = scratch.shape
     steep = abs(r1 - r0) > abs(c1 - c0)
     squared = (r1 - r0) ** 2 + (c1 - c0) ** 2

@@ -24,7 +24,7 @@ _POOL = 6  # neighbours; a pixel with more is inside an area that thinning could
 
 
 def gray_skeleton(ranks: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Thin the areas above every level, from the highest level down, keeping what higher levels have left.
+    """Thin the areas above every density level, from the highest level down, and keep the skeletons of higher levels.
 
     Busy roads are thinned first and keep their place; lower levels attach the quieter roads to them.
 
@@ -78,7 +78,7 @@ def gray_skeleton(ranks: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _neighbours(pixels: NDArray[np.uint8], place: NDArray[np.int64], cols: int) -> NDArray[np.int64]:
-    """Count the set neighbours of pixels of an image with so many columns."""
+    """Count the set neighbours of pixels in an image with a given number of columns."""
     count = np.zeros(len(place), np.int64)
     for step in (-cols - 1, -cols, -cols + 1, -1, 1, cols - 1, cols, cols + 1):
         count += pixels[place + step] > 0

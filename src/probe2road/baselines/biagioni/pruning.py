@@ -1,4 +1,4 @@
-"""Segments that trips do not bear out dropped, and what is left joined into longer ones."""
+"""Pruning: segments without enough support by trips are dropped, and the others joined into longer ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 
 def prune_segments(graph: RoadGraph, runs: Runs, *, min_runs: int) -> tuple[RoadGraph, Runs]:
-    """Keep the segments with enough good runs in one direction, and join them where only two are left at a node.
+    """Keep segments with enough good runs in one direction, and join them at nodes where only two are left.
 
     The published segments have a direction and a twin that has the other. Here a segment is undirected, and stays
     if one of the two would.
@@ -74,7 +74,7 @@ def prune_segments(graph: RoadGraph, runs: Runs, *, min_runs: int) -> tuple[Road
 
 
 def _chain_ids(graph: RoadGraph) -> NDArray[np.int64]:
-    """Return for every edge the id that merging nodes of degree 2 gives its chain: that of the first in table order."""
+    """Return, for every edge, the id that its chain gets when nodes of degree 2 are merged: that of its first edge."""
     mate = mates(*graph.end_rows.T)
     if not (mate >= 0).any():
         return graph.edges.index.to_numpy()
@@ -85,7 +85,7 @@ def _chain_ids(graph: RoadGraph) -> NDArray[np.int64]:
 
 
 def _on_segments(runs: Runs, segment: NDArray[np.int64]) -> Runs:
-    """Return the runs with other segments; those on -1 are dropped."""
+    """Return the runs with new segment numbers; runs with segment -1 are dropped."""
     kept = segment >= 0
     size = np.diff(runs.offsets)
     return Runs(

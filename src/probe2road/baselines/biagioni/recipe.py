@@ -70,19 +70,19 @@ def build_biagioni(
     workspace: str | Path | None = None,
     progress: Progress | None = None,
 ) -> RoadGraph:
-    """Build a road graph with the method of Biagioni and Eriksson; only traces are used.
+    """Build a road graph by the method of Biagioni and Eriksson, from traces only.
 
     Parameters
     ----------
     fleet
         From `probe2road.read_fleet`.
     options
-        The defaults where it is None.
+        None takes the defaults.
     workspace
         Folder for what every stage makes. A run on the same fleet with the same options takes the skeleton and the
-        result from it. Nothing is written where it is None.
+        result from it. Nothing is written if it is None.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------
@@ -118,7 +118,7 @@ def build_biagioni(
 
 
 def _built(fleet: Fleet, grid: Grid, options: BiagioniOptions, work: Workspace, report: Progress) -> RoadGraph:
-    """Build the map of a fleet: initial map, pruned, collapsed, pruned."""
+    """Build the map of a fleet: initial map, pruning, collapse, and pruning again."""
     skeleton = _skeleton(fleet, grid, options, work, report)
     graph = initial_map(skeleton, grid, tolerance=options.simplify_tolerance)
     work.write_graph(VECTORIZED, graph)
@@ -157,7 +157,7 @@ def _skeleton(
 def _match(
     observations: TripPositions, graph: RoadGraph, weight: NDArray[np.float64], options: BiagioniOptions
 ) -> Runs:
-    """Match all trips to the straight pieces of a map, and collect the good runs."""
+    """Match all trips to the straight pieces of a map, and return the good runs."""
     pieces = straight_pieces(graph)
     way, distance = match_pieces(observations, pieces, weight, options.matcher)
     return good_runs(

@@ -1,4 +1,4 @@
-"""The map that Biagioni and Eriksson match to: segments between intersections, and their straight pieces.
+"""The map for the matcher of Biagioni and Eriksson: segments between intersections, and their straight pieces.
 
 A segment is an edge of a road graph. Where its line bends, the published program has a vertex like any other: its
 matcher's states are the straight pieces between vertices, driven one way or the other.

@@ -1,4 +1,4 @@
-"""Which segments the trips drove, by the published matcher, and which of them may stay.
+"""Which segments the trips drove, by the published matcher, and which runs are good.
 
 Strategy
 --------
@@ -33,7 +33,7 @@ _NO_STEP = 1e12  # m; the observations need no further interpolation
 
 @dataclass(frozen=True)
 class TripPositions:
-    """Positions of all trips, no farther apart than the matcher wants them, O in all.
+    """The O positions of all trips, at most as far apart as the matcher requires.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class TripPositions:
 
 @dataclass(frozen=True)
 class Runs:
-    """Good runs of trips along segments, R of them with V observations.
+    """R good runs of trips along segments, with V observations.
 
     Attributes
     ----------
@@ -183,7 +183,7 @@ def good_runs(
 def _near_unknown(
     trip: NDArray[np.int64], seconds: NDArray[np.float64], unknown: NDArray[np.bool_], blackout: float
 ) -> NDArray[np.bool_]:
-    """Mark unknown observations, and those no more than ``blackout`` s from one of the same trip."""
+    """Mark unknown observations, and those within ``blackout`` s of an unknown one of the same trip."""
     near = unknown.copy()
     for way in (1, -1):
         last = -1

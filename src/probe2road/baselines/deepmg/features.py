@@ -1,4 +1,4 @@
-"""What DeepMG sees of traces: eleven planes and a table of neighbours for every cell (METHOD 3.1).
+"""The features of DeepMG: eleven planes and a table of neighbours for every cell (METHOD 3.1).
 
 Strategy
 --------
@@ -40,7 +40,7 @@ _BYTE = 256
 @dataclass(frozen=True)
 @checked
 class FeatureOptions:
-    """What a network was trained to see."""
+    """The features with which a network was trained."""
 
     resolution: Positive[float] = 2.0  # m, side of a cell; the published 1.95 m, rounded
     spacing: NotNegative[float] = 10.0  # m, least distance of fixes that are kept
@@ -56,7 +56,7 @@ class FeatureOptions:
 
 @dataclass(frozen=True)
 class Steps:
-    """N thinned fixes, and the steps that lead to some of them from the fix before.
+    """N thinned fixes, and the steps to some of them from the fix before.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Steps:
 
 
 def thin_traces(fleet: Fleet, options: FeatureOptions | None = None, *, gaps: TraceGaps | None = None) -> Steps:
-    """Thin the traces of a fleet to fixes that are some metres apart, and list the steps between them.
+    """Thin the traces of a fleet to fixes at a given distance (m), and list the steps between them.
 
     Fixes are left out, never interpolated. A fleet without fixes gives no steps.
 
@@ -90,7 +90,7 @@ def thin_traces(fleet: Fleet, options: FeatureOptions | None = None, *, gaps: Tr
     fleet
         The fleet; semantic points are not used.
     options
-        The defaults where it is None.
+        None takes the defaults.
     gaps
         Where traces are broken.
 
@@ -168,7 +168,7 @@ def extract_features(steps: Steps, grid: Grid, variant: Variant) -> tuple[NDArra
 
 
 def _near(steps: Steps, grid: Grid) -> NDArray[np.int64]:
-    """List the fixes whose step may touch the grid, ink of half a cell beside it included."""
+    """List the fixes whose step may touch the grid, including the half cell of ink on either side."""
     left, bottom, right, top = grid.bounds
     stop = np.flatnonzero(steps.valid)
     touching = np.ones(len(stop), bool)
@@ -179,7 +179,7 @@ def _near(steps: Steps, grid: Grid) -> NDArray[np.int64]:
 
 
 def _ink(steps: Steps, stop: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:
-    """Ink of all traces in each cell, shape (cells,)."""
+    """Return the ink of all traces in each cell, shape (cells,)."""
     ink = np.zeros(grid.shape)
     col, row = (steps.x - grid.left) / grid.resolution - 0.5, (grid.top - steps.y) / grid.resolution - 0.5
     _draw_traces(col[stop - 1], row[stop - 1], col[stop], row[stop], steps.trace[stop], ink)
@@ -190,7 +190,7 @@ def _ink(steps: Steps, stop: NDArray[np.int64], grid: Grid) -> NDArray[np.float6
 def _spaced(
     x: NDArray[np.float64], y: NDArray[np.float64], breaks: NDArray[np.bool_], spacing: float
 ) -> NDArray[np.bool_]:
-    """Mark the first fix of every run, and those at least the spacing (m) from the marked fix before."""
+    """Mark the first fix of every run, and fixes at least the spacing (m) away from the last marked fix."""
     kept = breaks.copy()
     last = 0
     for i in range(len(x)):
@@ -201,7 +201,7 @@ def _spaced(
 
 
 def _speeds(steps: Steps, stop: NDArray[np.int64], cell: NDArray[np.int64], n_cells: int) -> NDArray[np.float64]:
-    """Mean speed of the steps that start in each cell, from -1 (0 m/s, or unknown) to 1 (34 m/s)."""
+    """Return the mean speed of the steps that start in each cell, from -1 (0 m/s, or unknown) to 1 (34 m/s)."""
     start = cell[stop - 1]
     length = np.hypot(steps.x[stop] - steps.x[stop - 1], steps.y[stop] - steps.y[stop - 1])
     with np.errstate(divide="ignore"):
@@ -215,7 +215,7 @@ def _speeds(steps: Steps, stop: NDArray[np.int64], cell: NDArray[np.int64], n_ce
 def _directions(
     steps: Steps, stop: NDArray[np.int64], cell: NDArray[np.int64], n_cells: int, *, wraps: bool
 ) -> NDArray[np.float64]:
-    """Share of each of eight directions among the steps that start in each cell, shape (8, cells).
+    """Return the share of each of eight directions in the steps that start in each cell, shape (8, cells).
 
     Counts of the published code are bytes, which start again at 0 after 255.
     """
@@ -231,7 +231,7 @@ def _directions(
 def _neighbours(
     steps: Steps, stop: NDArray[np.int64], cell: NDArray[np.int64], grid: Grid, local_cells: int
 ) -> NDArray[np.uint8]:
-    """Pack the flags of where traces went to and came from, shape (16, cells)."""
+    """Return, packed as bits, from and to which neighbours traces went, shape (16, cells)."""
     flags = np.zeros((2 * COARSE_CELLS**2, grid.rows * grid.cols), bool)
     for first_bit, here, other in ((0, stop - 1, stop), (COARSE_CELLS**2, stop, stop - 1)):
         inside = cell[here] >= 0
@@ -253,7 +253,7 @@ def _draw_traces(
     trace: NDArray[np.int64],
     ink: NDArray[np.float64],
 ) -> None:
-    """Add the anti-aliased lines of traces to ink ``(rows, cols)``; each trace leaves the darkest of its own ink.
+    """Add the anti-aliased lines of traces to ink ``(rows, cols)``; each trace adds its darkest ink of each cell.
 
     Places are in cells from the centre of the top left cell. Steps are sorted by trace. For each column of a flat
     step (row of a steep one) the two cells beside the line share the ink by their distances from it (Wu 1991).

@@ -1,4 +1,4 @@
-"""Which proposed links become edges of the graph (METHOD 3.6, insertion)."""
+"""The choice of proposed links that become edges of the graph (METHOD 3.6, insertion)."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def add_links(graph: RoadGraph, variant: Variant, options: LinkOptions | None = 
 def choose_links(
     proposed: list[Link], degree: NDArray[np.int64], *, min_angle: float, stretch: float = 1.0
 ) -> list[Link]:
-    """Choose among links that end at one place in similar directions.
+    """Choose one of several links that end at one place in similar directions.
 
     Links are taken in the order of their places on the edges they lead to. One that is not shorter than a similar link
     at either of its ends is refused. Otherwise it replaces the similar ones, except those with an end of degree 2,
@@ -113,12 +113,12 @@ def _places(link: Link) -> tuple[_Place, _Place]:
 
 
 def _from(link: Link, place: _Place) -> tuple[float, float]:
-    """Return the vector of a link as it leaves one of its places."""
+    """Return the vector of a link, away from one of its places."""
     return link.vector if place == (link.start, 0.0) else (-link.vector[0], -link.vector[1])
 
 
 def _with_edges(graph: RoadGraph, links: list[Link]) -> RoadGraph:
-    """Split the edges that links lead into, and add the links."""
+    """Split the edges on which links end, and add the links."""
     names, edge_ids = graph.nodes.index.to_numpy(), graph.edges.index.to_numpy()
     inside = np.array([link.node == NO_NODE for link in links])
     along = np.array([round(link.along, 3) for link in links])

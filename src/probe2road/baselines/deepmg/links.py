@@ -33,7 +33,7 @@ _Vector = NDArray[np.float64]
 @dataclass(frozen=True)
 @checked
 class LinkOptions:
-    """Which links are proposed."""
+    """Which links DeepMG proposes."""
 
     radius: Positive[float] = 50.0  # m; longer links are never made
     snap: Positive[float] = 15.0  # m; a hit this near to a vertex of the polyline goes to that vertex
@@ -53,7 +53,7 @@ class Link(NamedTuple):
 
     @property
     def length(self) -> float:
-        """Metres."""
+        """Return the length, metres."""
         return float(np.hypot(*self.vector))
 
 
@@ -68,7 +68,7 @@ class _Edges(NamedTuple):
 
 
 class _End(NamedTuple):
-    """A dead end: its edge and node, its place, the polyline vertex before, and the other end of its edge."""
+    """A dead end: its edge and node, its position, the vertex before it, and the other end of its edge."""
 
     edge: int
     node: int
@@ -92,7 +92,7 @@ def propose_links(graph: RoadGraph, variant: Variant, options: LinkOptions | Non
     variant
         Decides how angles are measured, and which edges a link may not touch.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def propose_links(graph: RoadGraph, variant: Variant, options: LinkOptions | Non
 
 
 def angle_stretch(graph: RoadGraph) -> float:
-    """Return by how much longitudes stretch eastward lengths where angles are taken from degrees."""
+    """Return the factor on eastward lengths that computing angles in degrees of longitude and latitude implies."""
     left, bottom, right, top = graph.bounds
     _, latitude = transform((left + right) / 2, (bottom + top) / 2, graph.crs, WGS84)
     return float(1.0 / np.cos(np.radians(latitude)))
@@ -137,14 +137,14 @@ def angle_stretch(graph: RoadGraph) -> float:
 def bearing_difference(
     one: tuple[float, float] | _Vector, other: tuple[float, float] | _Vector, stretch: float
 ) -> float:
-    """Return the angle between two vectors, degrees from 0 to 180, after eastward lengths were stretched."""
+    """Return the angle between two vectors whose eastward lengths are stretched, degrees from 0 to 180."""
     cross = stretch * (one[0] * other[1] - one[1] * other[0])
     dot = stretch**2 * one[0] * other[0] + one[1] * other[1]
     return float(np.degrees(np.arctan2(abs(cross), dot)))
 
 
 def _edges(graph: RoadGraph, lines: NDArray[np.object_], stub: float) -> _Edges:
-    """Take the edges of a graph apart."""
+    """Return the edges of a graph by row."""
     u, v = graph.end_rows.T
     degree = np.bincount(graph.end_rows.ravel(), minlength=len(graph.nodes))
     vertices = [shapely.get_coordinates(line) for line in lines]
@@ -167,7 +167,7 @@ def _joins_same_nodes(edges: _Edges, one: int, other: int) -> bool:
 
 
 def _straight_on(edges: _Edges, end: _End, edge: int, stretch: float, options: LinkOptions) -> Link | None:
-    """Extend a dead end straight to an edge; where that misses, go to a node of it that lies ahead."""
+    """Extend a dead end straight to an edge; if it misses the edge, link to a node of the edge that lies ahead."""
     ahead = end.place - end.before
     ahead = ahead / np.hypot(*ahead)
     vertices, along = edges.vertices[edge], edges.along[edge]
@@ -189,7 +189,7 @@ def _straight_on(edges: _Edges, end: _End, edge: int, stretch: float, options: L
 
 
 def _from_stub(edges: _Edges, end: _End, edge: int, options: LinkOptions) -> Link | None:
-    """Link the end of an isolated stub to an edge beside it, where it is the nearer of its two ends."""
+    """Link the end of an isolated stub to an edge beside it, if it is the nearer one of its two ends."""
     distance, along = _foot(end.place, edges.vertices[edge], edges.along[edge])
     if distance < options.radius:
         nearer = distance < _foot(end.opposite, edges.vertices[edge], edges.along[edge])[0]
@@ -205,7 +205,7 @@ def _from_stub(edges: _Edges, end: _End, edge: int, options: LinkOptions) -> Lin
 
 
 def _link(edges: _Edges, end: _End, edge: int, along: float) -> Link:
-    """Make the link to a place on an edge; a place at an end of the edge is its node."""
+    """Return the link to a place on an edge; a place at the end of the edge becomes its node."""
     total = edges.along[edge][-1]
     node = int(edges.u[edge]) if along <= 0.0 else int(edges.v[edge]) if along >= total else NO_NODE
     place = [np.interp(along, edges.along[edge], edges.vertices[edge][:, axis]) for axis in (0, 1)]
@@ -213,7 +213,7 @@ def _link(edges: _Edges, end: _End, edge: int, along: float) -> Link:
 
 
 def _ray_hits(origin: _Vector, ahead: _Vector, vertices: _Vector) -> tuple[_Vector, _Vector]:
-    """Distance (m, infinite without a hit) at which a ray hits each piece, and the share of the piece there."""
+    """Return the distance (m) at which a ray hits each piece, infinity for a miss, and the share of the piece there."""
     step = np.diff(vertices, axis=0)
     to_start = vertices[:-1] - origin
     slope = ahead[0] * step[:, 1] - ahead[1] * step[:, 0]
@@ -225,7 +225,7 @@ def _ray_hits(origin: _Vector, ahead: _Vector, vertices: _Vector) -> tuple[_Vect
 
 
 def _foot(place: _Vector, vertices: _Vector, along: _Vector) -> tuple[float, float]:
-    """Distance to the nearest foot strictly inside a piece, and where it is along the edge; infinite without one."""
+    """Return the distance to the nearest perpendicular foot in a piece, infinity for none, and the place of it."""
     step = np.diff(vertices, axis=0)
     share = ((place - vertices[:-1]) * step).sum(axis=1) / (step**2).sum(axis=1)
     distance = np.hypot(*(vertices[:-1] + share[:, None] * step - place).T)
@@ -235,7 +235,7 @@ def _foot(place: _Vector, vertices: _Vector, along: _Vector) -> tuple[float, flo
 
 
 def _crosses(edges: _Edges, end: _End, link: Link, near: list[int], variant: Variant) -> bool:
-    """Tell whether a link crosses one of the edges near its dead end, other than that it leads to."""
+    """Tell whether a link crosses one of the edges near its dead end, except the edge that it leads to."""
     others = [edge for edge in near if edge != link.edge]
     if link.node != NO_NODE and not variant.crosses_at_target:
         others = [edge for edge in others if link.node not in (edges.u[edge], edges.v[edge])]
@@ -249,14 +249,14 @@ def _crosses(edges: _Edges, end: _End, link: Link, near: list[int], variant: Var
 
 
 def _left(a: _Vector, b: _Vector, c: _Vector) -> NDArray[np.bool_]:
-    """Tell whether a, b, c turn left, strictly; any of them of shape (2,) or (n, 2)."""
+    """Tell whether a, b, c turn strictly to the left; each has shape (2,) or (n, 2)."""
     return np.asarray(
         (c[..., 1] - a[..., 1]) * (b[..., 0] - a[..., 0]) > (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
     )
 
 
 def _distinct(links: list[Link], stretch: float, min_angle: float) -> list[Link]:
-    """Keep the links of one dead end that differ in direction from every shorter one that is kept."""
+    """Keep the links of one dead end that differ in direction from every shorter link that is kept."""
     kept: list[Link] = []
     for link in sorted(links, key=lambda one: one.length):
         if all(bearing_difference(link.vector, other.vector, stretch) >= min_angle for other in kept):

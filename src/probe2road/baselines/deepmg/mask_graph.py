@@ -1,4 +1,4 @@
-"""Mask to graph as DeepMG does it: thinned, told apart by the branches around every pixel, walked (METHOD 3.5)."""
+"""From mask to graph by the method of DeepMG: thinning, then tracing by the branches around each pixel (METHOD 3.5)."""
 
 from __future__ import annotations
 

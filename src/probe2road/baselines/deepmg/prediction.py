@@ -1,4 +1,4 @@
-"""Weights of T2RNet in a file, and what the network says about windows of a grid."""
+"""Weights files of T2RNet, and the network's predictions for windows of a grid."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 
 class TrainedNetwork(NamedTuple):
-    """A network and what it was trained to see."""
+    """A network and the options of the features it was trained with."""
 
     network: T2RNet
     variant: Variant
@@ -36,7 +36,7 @@ class TrainedNetwork(NamedTuple):
 
 
 def save_network(network: T2RNet, path: str | Path, *, variant: str, features: FeatureOptions) -> None:
-    """Write the weights of a network, in half precision, and what they need to be used; complete or absent."""
+    """Write a network's weights in half precision with all that prediction needs; the file is complete or absent."""
     width = network.region_head.in_channels
     halves = {name: part.half() if part.is_floating_point() else part for name, part in network.state_dict().items()}
     state = {"width": width, "variant": variant, "features": asdict(features), "network": halves}
@@ -45,7 +45,7 @@ def save_network(network: T2RNet, path: str | Path, *, variant: str, features: F
 
 
 def load_network(path: str | Path) -> TrainedNetwork:
-    """Read what `save_network` wrote; the network is ready to predict.
+    """Read a file of `save_network`; the network is ready to predict.
 
     Raises
     ------

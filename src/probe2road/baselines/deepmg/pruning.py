@@ -1,4 +1,4 @@
-"""What traces leave of a graph with links: the refinement of DeepMG (METHOD 3.7)."""
+"""Pruning of a graph with links by the traces: the refinement of DeepMG (METHOD 3.7)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 @checked
 class PruneOptions:
-    """How often a direction of an edge has to be driven."""
+    """How often each direction of an edge must be driven to be kept."""
 
     min_drives: NotNegative[int] = 1  # traversals of an edge of the mask
     min_link_drives: NotNegative[int] = 5  # traversals of a link
@@ -31,7 +31,7 @@ class PruneOptions:
 
 
 def prune_graph(graph: RoadGraph, traversals: NDArray[np.int64], options: PruneOptions | None = None) -> RoadGraph:
-    """Remove the directions of edges that are driven too seldom, edges without a direction, and links in excess.
+    """Remove the directions of edges that are driven too rarely, edges without a direction, and excess links.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def prune_graph(graph: RoadGraph, traversals: NDArray[np.int64], options: PruneO
     traversals
         Shape (edges, 2), from `probe2road.baselines.deepmg.traversals.count_traversals`.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------

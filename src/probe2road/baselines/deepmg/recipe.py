@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 @checked
 class DeepMGOptions:
-    """Everything that decides which graph comes out."""
+    """All options that determine the resulting graph."""
 
     weights: str = ""  # file of a trained network; it also says what the network was trained to see
     variant: Annotated[str, OneOf(*VARIANTS)] = "fixed"  # has to be that of the weights
@@ -51,7 +51,7 @@ class DeepMGOptions:
 
 @dataclass(frozen=True)
 class _Run:
-    """What the stages of a run depend on: the options, and the weights rather than the name of their file."""
+    """The inputs of the stages of a run: the options, and the content of the weights file instead of its name."""
 
     options: DeepMGOptions
     digest: str
@@ -77,7 +77,7 @@ def build_deepmg(
     workspace
         Folder for what the stages make, as for `probe2road.recipe.build`.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------
@@ -106,7 +106,7 @@ def build_deepmg(
 
 
 def _built(fleet: Fleet, options: DeepMGOptions, work: Workspace, report: Progress) -> RoadGraph:
-    """Build the graph of a fleet: mask, links, what traces confirm."""
+    """Build the graph of a fleet: mask, links, and the part that traces confirm."""
     variant = find_variant(options.variant)
     probability, grid, steps = _segment(fleet, options, work, report)
     mask = threshold_mask(probability, threshold=options.threshold)
@@ -127,7 +127,7 @@ def _built(fleet: Fleet, options: DeepMGOptions, work: Workspace, report: Progre
 def _segment(
     fleet: Fleet, options: DeepMGOptions, work: Workspace, report: Progress
 ) -> tuple[NDArray[np.float32], Grid, Steps]:
-    """Return centreline probability, its grid, and the thinned traces; cells nobody drove on take no memory."""
+    """Return the centreline probability, its grid, and the thinned traces; cells without drives use no memory."""
     from probe2road.baselines.deepmg.prediction import load_network, predict_windows  # needs torch
 
     trained = load_network(options.weights)
@@ -148,7 +148,7 @@ def _segment(
 
 
 def _digest(weights: str) -> str:
-    """Return a digest of the file of weights."""
+    """Return a digest of the weights file."""
     path = Path(weights)
     if not weights or not path.is_file():
         fix = "train a network with experiments/train_deepmg.py and name its weights.pt"

@@ -24,7 +24,7 @@ _SPREAD = 0.02  # standard deviation of the weights at the start
 
 
 class T2RNet(nn.Module):
-    """U-Net with one encoder and two decoders, for the region of roads and for their centrelines.
+    """A U-Net with one encoder and two decoders, for the region of roads and for their centrelines.
 
     Parameters
     ----------
@@ -97,13 +97,13 @@ def soft_dice_loss(probability: Tensor, label: Tensor) -> Tensor:
 
 
 def t2rnet_loss(outputs: tuple[Tensor, Tensor], line_label: Tensor, region_label: Tensor) -> Tensor:
-    """Return the loss of both decoders: 0.8 of the centreline's and 0.2 of the region's."""
+    """Return the sum of both decoders' losses: 0.8 of the centreline's and 0.2 of the region's."""
     line, region = outputs
     return (1.0 - REGION_SHARE) * soft_dice_loss(line, line_label) + REGION_SHARE * soft_dice_loss(region, region_label)
 
 
 def _block(channels_in: int, channels_out: int) -> nn.Sequential:
-    """Two 3 x 3 convolutions, each with batch normalisation and ReLU."""
+    """Return two 3 x 3 convolutions, each with batch normalisation and ReLU."""
     return nn.Sequential(
         nn.Conv2d(channels_in, channels_out, 3, padding=1), nn.BatchNorm2d(channels_out), nn.ReLU(inplace=True),
         nn.Conv2d(channels_out, channels_out, 3, padding=1), nn.BatchNorm2d(channels_out), nn.ReLU(inplace=True),
@@ -111,14 +111,14 @@ def _block(channels_in: int, channels_out: int) -> nn.Sequential:
 
 
 def _upsample(channels_in: int, channels_out: int) -> nn.Sequential:
-    """Double rows and columns by a transposed convolution with ReLU."""
+    """Return a transposed convolution with ReLU that doubles rows and columns."""
     return nn.Sequential(
         nn.ConvTranspose2d(channels_in, channels_out, 4, stride=2, padding=1, bias=False), nn.ReLU(inplace=True)
     )
 
 
 def _start(module: nn.Module) -> None:
-    """Draw the weights of convolutions from a normal distribution; their biases start at 0."""
+    """Draw the weights of convolutions from a normal distribution, and set biases to 0."""
     if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
         nn.init.normal_(module.weight, std=_SPREAD)
         if module.bias is not None:

@@ -18,8 +18,8 @@ from probe2road.baselines.deepmg.variants import find_variant
 from probe2road.errors import InputError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path
+from probe2road.raster.drawing import label_mask
 from probe2road.raster.grid import Grid
-from probe2road.raster.lines import label_mask
 
 __all__ = ["REGION_WIDTH", "TILE_CELLS", "Batch", "TileSet", "open_tiles", "read_batch", "tile_grids", "write_tiles"]
 
@@ -32,7 +32,7 @@ _INDEX = "tiles.json"
 
 
 class Batch(NamedTuple):
-    """B tiles."""
+    """The features and labels of B tiles."""
 
     planes: NDArray[np.float32]  # (B, 11, 256, 256)
     neighbours: NDArray[np.uint8]  # (B, 16, 256, 256), 128 bits packed
@@ -42,7 +42,7 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True)
 class TileSet:
-    """A folder of tiles, and what they were made with."""
+    """A folder of tiles, and the options they were made with."""
 
     folder: Path
     count: int
@@ -51,7 +51,7 @@ class TileSet:
 
 
 def tile_grids(squares: Sequence[Any], *, resolution: float, crs: Any) -> list[Grid]:
-    """Cover squares with as few tiles as possible, the outer ones flush with the square.
+    """Cover squares with as few tiles as possible; the outer tiles end at the border of the square.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def write_tiles(
     variant: str,
     features: FeatureOptions,
 ) -> TileSet:
-    """Compute features and labels of tiles and keep them in a folder, which is complete or absent.
+    """Compute features and labels of tiles, and write them to a folder that is complete or absent.
 
     Tiles without a fix are left out: there is nothing to see in them.
 
@@ -146,11 +146,11 @@ def read_batch(tiles: TileSet, numbers: Sequence[int]) -> Batch:
 
 
 def _inner(bounds: NDArray[np.float64], resolution: float) -> tuple[float, float, float, float]:
-    """Bounds whose far sides are half a cell inside, so that a cell that only touches them is not covered."""
+    """Return bounds with the far sides moved inwards by half a cell, to leave out cells that only touch them."""
     left, bottom, right, top = (float(value) for value in bounds)
     return left, bottom, right - resolution / 2, top - resolution / 2
 
 
 def _offsets(cells: int) -> list[int]:
-    """Where tiles start along a side."""
+    """Return where tiles start along a side."""
     return [int(at) for at in np.linspace(0, cells - TILE_CELLS, -(-cells // TILE_CELLS)).round()]

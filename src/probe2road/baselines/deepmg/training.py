@@ -1,4 +1,4 @@
-"""Training of T2RNet with the settings of its source code (METHOD 3.2), to be stopped and continued at will."""
+"""Training of T2RNet with the settings of its source code (METHOD 3.2); a run can be interrupted and continued."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class TrainOptions:
 
 @dataclass
 class _Run:
-    """The state of a training, as it is kept in a checkpoint."""
+    """The state of a training run, as stored in a checkpoint."""
 
     network: T2RNet
     optimiser: torch.optim.Adam
@@ -73,7 +73,7 @@ def train(tiles: TileSet, validation: TileSet, folder: str | Path, options: Trai
         Created where it does not exist. ``weights.pt`` has the best weights so far, ``history.csv`` a line for each
         epoch, ``checkpoint.pt`` what is needed to go on.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -104,7 +104,7 @@ def train(tiles: TileSet, validation: TileSet, folder: str | Path, options: Trai
 
 
 def _epoch(run: _Run, tiles: TileSet, validation: TileSet, folder: Path, options: TrainOptions) -> dict[str, float]:
-    """Train on every tile once; return the row of the history, in which F1 is the last one measured."""
+    """Train on every tile once; return a row of the history, with the F1 that was measured last."""
     rate = options.learning_rate * 0.5 ** (run.epoch // options.halve_every)
     for group in run.optimiser.param_groups:
         group["lr"] = rate
@@ -120,7 +120,7 @@ def _epoch(run: _Run, tiles: TileSet, validation: TileSet, folder: Path, options
 
 
 def _start(tiles: TileSet, folder: Path, options: TrainOptions) -> _Run:
-    """Begin a run, or take up the one whose checkpoint is in the folder."""
+    """Begin a run, or continue the run whose checkpoint is in the folder."""
     torch.manual_seed(options.seed)
     network = T2RNet(options.width).to(options.device)
     run = _Run(network, torch.optim.Adam(network.parameters(), lr=options.learning_rate, betas=_BETAS))
@@ -139,13 +139,13 @@ def _start(tiles: TileSet, folder: Path, options: TrainOptions) -> _Run:
 
 
 def _settings(tiles: TileSet, options: TrainOptions) -> dict[str, Any]:
-    """Return what must not change within a run."""
+    """Return the settings that must not change within a run."""
     settings = asdict(options) | {"variant": tiles.variant, "features": asdict(tiles.features), "tiles": tiles.count}
     return {name: value for name, value in settings.items() if name not in ("epochs", "device")}
 
 
 def _step(run: _Run, batch: Batch, options: TrainOptions) -> float:
-    """Take one step of training; return the loss."""
+    """Do one training step, and return its loss."""
     run.network.train()
     planes, neighbours, line, region = _tensors(batch, options.device)
     with torch.autocast(options.device, torch.bfloat16, enabled=options.bfloat16):
@@ -158,7 +158,7 @@ def _step(run: _Run, batch: Batch, options: TrainOptions) -> float:
 
 
 def _validated(run: _Run, tiles: TileSet, folder: Path, options: TrainOptions) -> float:
-    """Return the F1 of centreline cells, pooled over all tiles; keep the weights where it is the best so far."""
+    """Return the F1 of centreline cells, pooled over all tiles; keep the weights if it is the best so far."""
     run.network.eval()
     counts = np.zeros(3)  # hits, found, true
     with torch.no_grad():
@@ -174,13 +174,13 @@ def _validated(run: _Run, tiles: TileSet, folder: Path, options: TrainOptions) -
 
 
 def _in_order(tiles: TileSet) -> Iterator[Batch]:
-    """Yield all tiles in batches."""
+    """Yield all tiles in batches, in order."""
     for start in range(0, tiles.count, _VALIDATION_BATCH):
         yield read_batch(tiles, range(start, min(start + _VALIDATION_BATCH, tiles.count)))
 
 
 def _tensors(batch: Batch, device: str) -> tuple[Tensor, ...]:
-    """Unpack a batch into tensors of the network."""
+    """Convert a batch to the tensors that the network takes."""
 
     def tensor(array: NDArray[Any]) -> Tensor:
         return torch.from_numpy(array).to(device, torch.float32)
@@ -192,7 +192,7 @@ def _tensors(batch: Batch, device: str) -> tuple[Tensor, ...]:
 
 
 def _write_checkpoint(run: _Run, tiles: TileSet, folder: Path, options: TrainOptions) -> None:
-    """Keep what is needed to go on, and the history as a table."""
+    """Write all that is needed to continue, and the history as a table."""
     state = {
         "network": run.network.state_dict(),
         "optimiser": run.optimiser.state_dict(),

@@ -39,7 +39,7 @@ _REACH, _REACH_FACTOR = 200.0, 4.0  # m, and times the straight line: bound of t
 @dataclass(frozen=True)
 @checked
 class MatcherOptions:
-    """The matcher's numbers, as published."""
+    """The parameters of the matcher, as published."""
 
     radius: Positive[float] = 50.0  # m, within which edges are candidates
     sigma: Positive[float] = 50.0  # m, standard deviation of fixes
@@ -48,7 +48,7 @@ class MatcherOptions:
 
 
 class _Model(NamedTuple):
-    """What the kernels need: the network with lengths as routes count them, factors of edges, and numbers."""
+    """The input of the compiled functions: the network with its routing lengths, factors of edges, and parameters."""
 
     states: States  # with lengths on the ground
     routed: States  # with lengths as routes count them
@@ -61,7 +61,7 @@ class _Model(NamedTuple):
 
 
 class _Chain(NamedTuple):
-    """Candidates of the fixes of one run, those of fix k from ``first[k]`` to ``first[k + 1]``, and their scores."""
+    """The candidates of the fixes of one run (fix k: ``first[k]`` to ``first[k + 1]``), and their scores."""
 
     first: NDArray[np.int64]
     state: NDArray[np.int64]
@@ -82,7 +82,7 @@ def count_traversals(
     graph
         Road graph in the same CRS; all edges may be driven both ways.
     options
-        The defaults where it is None.
+        None takes the defaults.
     min_path
         Pieces of a trace that drive fewer edges than this are left out, as are single fixes.
 
@@ -125,7 +125,7 @@ def count_traversals(
 def _count(
     model: _Model, x: NDArray[np.float64], y: NDArray[np.float64], starts: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Match run by run, and count the directed edges of all pieces."""
+    """Match each run, and count the directed edges of all matched pieces."""
     count = np.zeros(len(model.states.head), np.int64)
     scratch, labels = new_scratch(len(model.states.x)), new_labels(len(model.states.head))
     for run in range(len(starts) - 1):
@@ -151,7 +151,7 @@ def _count(
 
 @njit(cache=True)
 def _add_piece(piece: list[int], min_path: int, count: NDArray[np.int64]) -> None:
-    """Count the directed edges of a piece that is long enough."""
+    """Count the directed edges of a matched piece, if it is long enough."""
     if len(piece) >= max(min_path, 1):
         for state in piece:
             count[state] += 1
@@ -159,7 +159,7 @@ def _add_piece(piece: list[int], min_path: int, count: NDArray[np.int64]) -> Non
 
 @njit(cache=True)
 def _candidates(model: _Model, x: NDArray[np.float64], y: NDArray[np.float64], query: int, scratch: Scratch) -> _Chain:
-    """List the candidates of fixes with the logarithms of their densities as scores; ``query`` as in the search."""
+    """List the candidates of fixes with the logarithms of their densities as scores; ``query`` numbers the search."""
     states = model.states
     first = np.zeros(len(x) + 1, np.int64)
     state, progress, score = [0 for _ in range(0)], [0.0 for _ in range(0)], [0.0 for _ in range(0)]
@@ -177,7 +177,7 @@ def _candidates(model: _Model, x: NDArray[np.float64], y: NDArray[np.float64], q
 
 @njit(cache=True)
 def _forward(model: _Model, x: NDArray[np.float64], y: NDArray[np.float64], chain: _Chain, labels: Labels) -> None:
-    """Turn the densities of candidates into the scores of the best chains that end there.
+    """Replace the scores of candidates by those of the best chains that end there.
 
     Candidates that no route reaches are left out from then on (score -inf), unless none is reached at all.
     """
@@ -200,7 +200,7 @@ def _forward(model: _Model, x: NDArray[np.float64], y: NDArray[np.float64], chai
 
 @njit(cache=True)
 def _backward(chain: _Chain) -> NDArray[np.int64]:
-    """Follow the best chains from their ends; the candidate of each fix, -1 without one."""
+    """Follow the best chains back from their ends; return the candidate of each fix, -1 for none."""
     chosen = np.full(len(chain.first) - 1, -1, np.int64)
     here = -1
     for k in range(len(chosen) - 1, -1, -1):
@@ -228,7 +228,7 @@ def _search(model: _Model, chain: _Chain, source: int, low: int, high: int, stra
 
 @njit(cache=True)
 def _route(model: _Model, chain: _Chain, source: int, target: int, labels: Labels) -> tuple[float, bool]:
-    """Length of the route between two candidates as it counts, infinite without one, and whether it stays."""
+    """Return the routing length between two candidates, infinity for no route, and whether it stays on one edge."""
     d = chain.state[target]
     if chain.state[source] == d:
         step = chain.progress[target] - chain.progress[source]
@@ -242,7 +242,7 @@ def _route(model: _Model, chain: _Chain, source: int, target: int, labels: Label
 def _append_route(
     model: _Model, chain: _Chain, source: int, target: int, straight: float, labels: Labels, piece: list[int]
 ) -> None:
-    """Append the directed edges of a route behind its first to a piece."""
+    """Append the directed edges of a route, without the first one, to a piece."""
     d = chain.state[target]
     if chain.state[source] == d:
         return

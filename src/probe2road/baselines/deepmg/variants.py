@@ -1,4 +1,4 @@
-"""The two ways to run DeepMG: as its published code does, and with that code's defects repaired."""
+"""The two variants of DeepMG: like its published code, and with the defects of that code repaired."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["VARIANTS", "Variant", "find_variant"]
 
 @dataclass(frozen=True)
 class Variant:
-    """What the published code does in a way that its paper does not describe (METHOD 3.3, 3.5 to 3.7)."""
+    """Where the published code differs from its paper (METHOD 3.3, 3.5 to 3.7)."""
 
     name: str
     batch_size: int  # tiles of a training step; the published loader ignores its option and takes one

@@ -1,4 +1,4 @@
-"""The aligned fleet of a data set: what `probe2road align` makes of its raw one, kept beside it."""
+"""The aligned fleet of a data set: the result of ``probe2road align`` for its raw fleet, stored beside it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WORKSPACE = ".aligned"
 
 
 def align_dataset(folder: str | Path, *, workers: int = 1, progress: Progress | None = None) -> Path:
-    """Align the raw fleet of a data set with the default options, unless that was done before.
+    """Align the raw fleet of a data set with the default options, unless the result exists.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def align_dataset(folder: str | Path, *, workers: int = 1, progress: Progress | 
     workers
         Processes; no influence on the result beyond millimetres.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The data sets of the open benchmark: which roads, which fleet, which seed, which splits, and what each is for.
+"""The data sets of the open benchmark: roads, fleet, seed, splits, and purpose of each.
 
 The roles follow the paper: one city to train and test on, two cities that only ever test. What may choose anything
 (weights, thresholds, options) is said by the role, and boston, hannover and tokyo_shibuya never do.
@@ -43,12 +43,12 @@ class Dataset:
 
     @property
     def generated(self) -> bool:
-        """Whether the roads need no external data."""
+        """Tell whether the roads need no external data."""
         return self.network.startswith("generate:")
 
     @property
     def fleet(self) -> Preset:
-        """The preset with the demand of the benchmark."""
+        """Return the preset of the data set, with the demand of the benchmark."""
         preset = find_preset(self.preset)
         return replace(preset, demand=replace(preset.demand, zipf_exponent=self.zipf_exponent))
 
@@ -98,7 +98,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
 
 
 def find_dataset(name: str) -> Dataset:
-    """Return a data set by name; ``NAME-PRESET`` is the same roads and drives with another preset.
+    """Return a data set by name; ``NAME-PRESET`` has the same roads and drives with another preset.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def find_dataset(name: str) -> Dataset:
 
 
 def find_datasets(names: list[str]) -> list[Dataset]:
-    """Return data sets by name or by group, each once, in the order given; all cities where no name is given.
+    """Return data sets by name or by group, each once, in the given order; without a name, all cities.
 
     Raises
     ------

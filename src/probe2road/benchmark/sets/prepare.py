@@ -1,4 +1,4 @@
-"""Making the data sets of the benchmark: one folder each, complete or resumable, with checksums and licence."""
+"""Preparation of the data sets of the benchmark: one folder each, with checksums and licence, resumable."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def prepare(
     workers
         Processes that simulate; no influence on the result.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------
@@ -142,7 +142,7 @@ def prepare_dataset(
 
 
 def check_dataset(folder: str | Path) -> None:
-    """Verify that a data set is complete and as it was made.
+    """Check that a data set is complete and unchanged.
 
     Raises
     ------
@@ -194,7 +194,7 @@ def _write_tiles(network: RoadNetwork, definition: Dataset, path: Path) -> None:
 
 
 def _manifest(definition: Dataset, recording: Recording, extract: Path | None) -> dict[str, Any]:
-    """Everything that identifies a data set: definition, run, licence, and a checksum of every file."""
+    """Return all that identifies a data set: definition, run, licence, and a checksum of every file."""
     files = sorted({*recording.files, *recording.folder.glob(_TILES), recording.folder / _README})
     return {
         "definition": asdict(definition),
@@ -207,7 +207,7 @@ def _manifest(definition: Dataset, recording: Recording, extract: Path | None) -
 
 
 def _readme(definition: Dataset, recording: Recording) -> str:
-    """Text for whoever finds the folder."""
+    """Return a text that explains the folder."""
     counts = recording.run["counts"]
     licence = (
         "The roads are generated: no external data is in it. The licence is that of probe2road, Apache-2.0."
@@ -230,7 +230,7 @@ def _readme(definition: Dataset, recording: Recording) -> str:
 
 
 def _checksum(path: Path) -> str:
-    """SHA-256 of a file."""
+    """Return the SHA-256 of a file."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(_BLOCK):
@@ -239,7 +239,7 @@ def _checksum(path: Path) -> str:
 
 
 def _named(progress: Progress | None, name: str) -> Progress | None:
-    """Put the name of the data set before each stage."""
+    """Return a progress callback that puts the name of the data set before each stage."""
     if progress is None:
         return None
     return lambda stage, done, total: progress(f"{name}: {stage}", done, total)

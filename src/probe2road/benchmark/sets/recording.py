@@ -1,4 +1,4 @@
-"""A simulated fleet on disk, written as it is driven: bounded memory, and a killed run goes on where it stopped.
+"""A simulated fleet on disk, written while it is driven: memory is limited, and an interrupted run continues.
 
 Strategy: the drives come in portions, and each portion becomes one folder of small Parquet files, which is complete
 or absent. When all portions are there they are joined, file by file, into the tables of the recording. A drive
@@ -61,52 +61,52 @@ _REFERENCE = "reference.gpkg"
 
 @dataclass(frozen=True)
 class Recording:
-    """What `record_fleet` wrote: files that a simulated fleet may have, in one folder."""
+    """The files that `record_fleet` writes for a simulated fleet, in one folder."""
 
     folder: Path
 
     @property
     def drives(self) -> Path:
-        """Raw traces; the points lie beside them, where there is a camera."""
+        """Return the file of raw traces; the points, if there is a camera, are beside it."""
         return self.folder / _FILES["traces"]
 
     @property
     def modelled(self) -> Path:
-        """Traces with the errors that an alignment leaves; absent where they were not asked for."""
+        """Return the file of traces with the modelled errors of an alignment; it may be missing."""
         return self.folder / _FILES["modelled_traces"]
 
     @property
     def aligned(self) -> Path:
-        """Traces as `probe2road.benchmark.sets.aligning.align_dataset` leaves them; absent before."""
+        """Return the file of traces from `probe2road.benchmark.sets.aligning.align_dataset`; it may be missing."""
         return self.folder / "aligned.parquet"
 
     def traces(self, poses: str) -> Path:
-        """Traces with some of `POSES`."""
+        """Return the file of traces with the given poses, one of `POSES`."""
         return {"aligned": self.aligned, "modelled": self.modelled, "raw": self.drives}[poses]
 
     @property
     def poses(self) -> Path:
-        """True poses, row by row those of the traces."""
+        """Return the file of true poses, row by row those of the traces."""
         return self.folder / _FILES["poses"]
 
     @property
     def routes(self) -> Path:
-        """Sections driven."""
+        """Return the file of the driven sections."""
         return self.folder / _FILES["routes"]
 
     @property
     def reference(self) -> Path:
-        """The true road graph with the true numbers of drives."""
+        """Return the file of the true road graph with the true numbers of drives."""
         return self.folder / _REFERENCE
 
     @property
     def run(self) -> dict[str, Any]:
-        """How it was made: preset, seed, amount, versions, counts."""
+        """Return how the recording was made: preset, seed, amount, versions, counts."""
         return dict(json.loads((self.folder / RUN_FILE).read_text(encoding="utf-8")))
 
     @property
     def files(self) -> list[Path]:
-        """All files of the recording that there are, ordered by name."""
+        """Return all existing files of the recording, sorted by name."""
         names = [*_FILES.values(), _REFERENCE, RUN_FILE]
         return sorted(self.folder / name for name in names if (self.folder / name).exists())
 
@@ -123,7 +123,7 @@ def record_fleet(
     residual: ResidualModel | None = None,
     progress: Progress | None = None,
 ) -> Recording:
-    """Simulate a fleet and write what it recorded, and the truth, to a folder.
+    """Simulate a fleet, and write its recorded data and the truth to a folder.
 
     Parameters
     ----------
@@ -237,13 +237,13 @@ def _simulate_portions(
     residual: ResidualModel | None,
     progress: Progress | None,
 ) -> None:
-    """Drive what is missing and write it, portion by portion."""
-    number, km = 0, 0.0
+    """Simulate the missing drives, and write them portion by portion."""
+    number, driven_km = 0, 0.0
     for path in _complete(portions):
-        number, km = number + _about(path)["drives"], km + _about(path)["km"]
-    wanted, done = (amount["n_drives"], number) if amount["n_drives"] is not None else (amount["drive_km"], km)
+        number, driven_km = number + _about(path)["drives"], driven_km + _about(path)["km"]
+    wanted, done = (amount["n_drives"], number) if amount["n_drives"] is not None else (amount["drive_km"], driven_km)
     if number:
-        logger.info("going on behind drive %d (%.0f km)", number - 1, km)
+        logger.info("going on behind drive %d (%.0f km)", number - 1, driven_km)
     if wanted is not None and number and done >= wanted:
         return
     left = {name: None if value is None else value - done for name, value in amount.items()}
@@ -253,18 +253,20 @@ def _simulate_portions(
     )  # fmt: skip
     for part, chunk in enumerate(chunks, start=len(_complete(portions))):
         _write_portion(chunk, portions / f"{part:06d}", residual, seed)
-        number, km = number + len(chunk.length), km + float(chunk.length.sum()) / 1000.0
+        number, driven_km = number + len(chunk.length), driven_km + float(chunk.length.sum()) / 1000.0
         if progress is not None and wanted is not None:
-            progress("drives" if amount["n_drives"] is not None else "km", _done(amount, number, km), int(wanted))
+            progress(
+                "drives" if amount["n_drives"] is not None else "km", _done(amount, number, driven_km), int(wanted)
+            )
 
 
 def _done(amount: Mapping[str, float | None], number: int, km: float) -> int:
-    """How much of the amount is reached."""
+    """Return how much of the required amount is done."""
     return number if amount["n_drives"] is not None else min(int(km), int(amount["drive_km"] or 0))
 
 
 def _complete(portions: Path) -> list[Path]:
-    """Folders of the portions that are there; they are written in order, so none is missing between them."""
+    """Return the folders of the portions that exist; they are written in order, so none is missing between them."""
     return sorted(path for path in portions.iterdir() if path.is_dir() and not path.name.startswith("."))
 
 
@@ -291,7 +293,7 @@ def _write_portion(chunk: FleetChunk, path: Path, residual: ResidualModel | None
 
 
 def _join(network: RoadNetwork, portions: Path, recording: Recording, run: Mapping[str, Any]) -> dict[str, float]:
-    """Join the portions to the files of the recording; the last file says that all are there."""
+    """Join the portions to the files of the recording; the last file marks the recording as complete."""
     parts = _complete(portions)
     abouts = [_about(part) for part in parts]
     counts: dict[str, float] = {"drives": sum(about["drives"] for about in abouts)}
@@ -312,7 +314,7 @@ def _join(network: RoadNetwork, portions: Path, recording: Recording, run: Mappi
 
 
 def _join_table(parts: list[Path], name: str, target: Path, crs: Mapping[str, Any], boxes: list[list[float]]) -> int:
-    """Copy a table of all portions into one file, a row group or more for each portion; returns the rows."""
+    """Copy a table of all portions into one file, with at least one row group for each; return the number of rows."""
     schema = pq.read_schema(parts[0] / f"{name}.parquet")
     if boxes:
         lows, highs = np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]
@@ -335,7 +337,7 @@ def _join_table(parts: list[Path], name: str, target: Path, crs: Mapping[str, An
 
 
 def _counted(network: RoadNetwork, parts: list[Path]) -> RoadGraph:
-    """Return the true road graph with the drives of all portions; no drive is in two of them."""
+    """Return the true road graph with the drives of all portions added; no drive is in two portions."""
     reference = network.reference_graph()
     columns = ["support", "forward", "backward"]
     total = pd.DataFrame(0, index=reference.edges.index, columns=columns, dtype="Int64")
@@ -350,12 +352,12 @@ def _counted(network: RoadNetwork, parts: list[Path]) -> RoadGraph:
 
 
 def _routes(parts: list[Path]) -> Iterator[pd.DataFrame]:
-    """Routes of each portion."""
+    """Yield the routes of each portion."""
     return (pq.read_table(part / "routes.parquet", partitioning=None).to_pandas() for part in parts)
 
 
 def _fingerprint(network: RoadNetwork) -> str:
-    """Digest of everything in a network that drives depend on."""
+    """Return a digest of everything in a network on which drives depend."""
     digest = hashlib.blake2b(f"{network.crs.to_wkt()}{network.driving_side}{network.markings}".encode(), digest_size=16)
     for table in (network.sections.drop(columns="geometry"), network.restrictions):
         digest.update(table.to_csv().encode())

@@ -1,4 +1,4 @@
-"""References of the benchmark: the roads that enough drives passed, without any matching."""
+"""Reference graphs of the benchmark: the roads that enough drives passed, known without any matching."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PRIMARY_ROADS = ("primary", "primary_link")
 
 
 def labelled_reference(reference: RoadGraph, *, min_drives: int = 4) -> RoadGraph:
-    """Keep the edges that enough drives passed: what labels are drawn from and scores are taken against.
+    """Keep the edges that enough drives passed: the reference for labels and for scores.
 
     The drives of the simulator begin and end at nodes, so every piece of an edge was passed by as many drives as the
     whole, and cutting edges first would change nothing.
@@ -70,7 +70,7 @@ def labelled_reference(reference: RoadGraph, *, min_drives: int = 4) -> RoadGrap
 
 
 def main_roads(network: RoadNetwork, *, main: Sequence[str] = MAIN_ROADS, reach: float = 300.0) -> RoadNetwork:
-    """Keep main roads, and other roads where they meet them.
+    """Keep main roads, and the parts of other roads near places where they meet main roads.
 
     Read the network with the classes that shall be there at all; heights are solved by then, so that a road that is
     left out here still has its bridge over one that stays.

@@ -1,4 +1,4 @@
-"""The errors that an alignment of fleet data leaves, put on true poses: aligned fleet data without an aligner.
+"""The errors that an alignment leaves, added to true poses: aligned fleet data without running an alignment.
 
 Alignment brings the drives together to decimetres and cannot know where the whole lies: what all receivers got
 wrong at a place stays in the map. Both parts vary slowly, the first along each drive, the second over the plane.
@@ -32,7 +32,7 @@ _PLACE_WAVES, _DRIVE_WAVES = 64, 24  # waves in a sum; more are closer to a norm
 @dataclass(frozen=True)
 @checked
 class ResidualModel:
-    """How far aligned poses are from the truth; one sigma each.
+    """How far aligned poses are from the truth; each value is one sigma.
 
     Published systems that align camera points of fleets report less than 0.2 m at signs (Dabeer et al. 2017, 25
     journeys) and less than 0.5 m on average (Immel et al. 2023); a floor stays that the bias of GNSS sets
@@ -52,7 +52,7 @@ class ResidualModel:
 
     @property
     def accuracy(self) -> float:
-        """Horizontal error of a pose, one sigma in any direction, m."""
+        """Return the horizontal error of a pose, one sigma in any direction, m."""
         return float(np.sqrt(self.place_sigma**2 + (self.lateral_sigma**2 + self.longitudinal_sigma**2) / 2.0))
 
 
@@ -116,14 +116,14 @@ def align_drives(
 
 
 def _place_errors(xy: NDArray[np.float64], model: ResidualModel, seed: int) -> NDArray[np.float64]:
-    """Errors that all drives share: shape ``(n, 3)``, m east, north and up."""
+    """Return the errors that all drives share at positions: shape ``(n, 3)``, m east, north and up."""
     rng = _stream(seed, _PLACE)
     sigmas = (model.place_sigma, model.place_sigma, model.place_height_sigma)
     return np.column_stack([sigma * _smooth(xy / model.place_length, _PLACE_WAVES, rng) for sigma in sigmas])
 
 
 def _drive_errors(xyz: NDArray[np.float64], model: ResidualModel, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Errors of one drive: shape ``(n, 4)``, m to the right, ahead and up, and degrees of heading."""
+    """Return the errors of one drive: shape ``(n, 4)``, m to the right, ahead and up, and degrees of heading."""
     step = np.hypot(np.diff(xyz[:, 0], prepend=xyz[0, 0]), np.diff(xyz[:, 1], prepend=xyz[0, 1]))
     along = np.cumsum(step)[:, None] / model.drive_length
     sigmas = (model.lateral_sigma, model.longitudinal_sigma, model.height_sigma, model.heading_sigma)
@@ -131,7 +131,7 @@ def _drive_errors(xyz: NDArray[np.float64], model: ResidualModel, rng: np.random
 
 
 def _smooth(at: NDArray[np.float64], waves: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Smooth random function of variance 1 and scale 1 at positions of shape ``(n, d)``: shape ``(n,)``."""
+    """Return a smooth random function of variance 1 and scale 1 at positions ``(n, d)``: shape ``(n,)``."""
     frequency = rng.standard_normal((waves, at.shape[1]))
     phase = rng.uniform(0.0, 2.0 * np.pi, waves)
     return _sum_waves(np.ascontiguousarray(at), frequency, phase)
@@ -141,7 +141,7 @@ def _smooth(at: NDArray[np.float64], waves: int, rng: np.random.Generator) -> ND
 def _sum_waves(
     at: NDArray[np.float64], frequency: NDArray[np.float64], phase: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Sum of cosines, shape ``(n,)``, at positions ``(n, d)``; frequencies ``(k, d)``, phases ``(k,)``."""
+    """Return a sum of cosines, shape ``(n,)``, at positions ``(n, d)``; frequencies ``(k, d)``, phases ``(k,)``."""
     out = np.zeros(len(at))
     scale = np.sqrt(2.0 / len(phase))
     for i in range(len(at)):
@@ -168,12 +168,12 @@ def _moved_points(points: pd.DataFrame, old: pd.DataFrame, new: pd.DataFrame) ->
 
 
 def _rows_of_points(points: pd.DataFrame, traces: pd.DataFrame) -> NDArray[np.int64]:
-    """Row of the fix that each point was seen from: the one of its drive at its time."""
+    """Return the row of the fix that each point was seen from: the fix of its drive at its time."""
     rows = pd.DataFrame({"trace_id": traces["trace_id"], "t": traces["t"], "row": np.arange(len(traces))})
     found = points[["trace_id", "t"]].merge(rows.drop_duplicates(["trace_id", "t"]), how="left")["row"]
     return found.to_numpy(np.int64)
 
 
 def _stream(seed: int, *keys: int) -> np.random.Generator:
-    """Random stream of a place or a drive: a function of the seed and the keys alone."""
+    """Return the random stream of a place or a drive: a function of the seed and the keys alone."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STREAM, *keys)))

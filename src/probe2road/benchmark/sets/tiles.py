@@ -1,4 +1,4 @@
-"""Tiles of one square kilometre, and splits of them that share no road.
+"""Tiles of one square kilometre, and splits of them that have no road in common.
 
 Strategy: validation and test tiles are compact blocks of neighbours. Around each block every tile of another split
 is left out, so that at least one whole tile lies between any two splits. The blocks are drawn many times over; of
@@ -31,7 +31,7 @@ _Tile = tuple[int, int]
 
 
 def motorway_tiles(network: RoadNetwork, *, size: float = TILE_SIZE) -> gpd.GeoDataFrame:
-    """List the tiles of a network that hold motorway or motorway ramps.
+    """List the tiles of a network that contain motorways or their ramps.
 
     Tiles are aligned to multiples of their size in the network's CRS.
 
@@ -146,7 +146,7 @@ def split_tiles(
 
 
 def split_area(tiles: gpd.GeoDataFrame, split: str, *, inset: float = 0.0) -> shapely.Geometry:
-    """Return the area of a split, to clip to: a polygon or several.
+    """Return the area of a split as a polygon or several polygons, for clipping.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def split_area(tiles: gpd.GeoDataFrame, split: str, *, inset: float = 0.0) -> sh
 
 
 def _crossings(network: RoadNetwork) -> NDArray[np.float64]:
-    """Places where two sections cross in plan without a common node: shape ``(n, 2)``, m."""
+    """Return the places where two sections without a common node cross in plan: shape ``(n, 2)``, m."""
     lines = network.sections.geometry.to_numpy()
     ends = network.sections[["u", "v"]].to_numpy()
     i, j = shapely.STRtree(lines).query(lines, predicate="crosses")
@@ -190,7 +190,7 @@ def _crossings(network: RoadNetwork) -> NDArray[np.float64]:
 def _draw(
     places: list[_Tile], counts: Mapping[str, int], rng: np.random.Generator
 ) -> tuple[dict[str, list[_Tile]], set[_Tile]] | None:
-    """Draw blocks for test and validation: the tiles of each, and those that no block touches."""
+    """Draw blocks for test and validation: return the tiles of each, and those that no block touches."""
     free = set(places)
     drawn: dict[str, list[_Tile]] = {}
     for split in ("test", "validation"):
@@ -208,7 +208,7 @@ def _draw(
 
 
 def _grow(free: list[_Tile], size: int, rng: np.random.Generator) -> list[_Tile] | None:
-    """Grow a block of neighbours from a random tile; None where it is enclosed or nothing is free."""
+    """Grow a block of adjacent tiles from a random tile; return None if there is not enough space."""
     if not free:
         return None
     available = set(free)

@@ -1,4 +1,4 @@
-"""The paper's tables on open data: methods times data sets, scored, with intervals, pictures and what they cost."""
+"""The paper's tables on open data: methods times data sets, with scores, intervals, pictures and costs."""
 
 from pkgutil import iter_modules
 

@@ -1,4 +1,4 @@
-"""One command for all ablations: build, score, draw, and write a page with a table and a figure for each."""
+"""The run of all ablations: build, score, draw, and write a page with a table and a figure for each."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def run_ablations(
     trainings
         JSON file of ``experiments/training_experiments.py``, from which the losses are compared.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------
@@ -110,14 +110,14 @@ def run_ablations(
 
 
 def _cell(variant: AblationValue) -> Cell:
-    """Build and score a variant; of a data set with splits, where it is validated."""
+    """Build and score a variant; for a data set with splits, on the validation split."""
     build_cell(variant.source, variant.method, like=variant.like)
     full = [cell for cell in score_cells(variant.source, variant.method) if cell.stage == FULL]
     return next((cell for cell in full if cell.area.endswith("validation")), full[0])
 
 
 def _draw(ablation: Ablation, cells: Sequence[Cell], output: Path) -> None:
-    """Draw the figure of an ablation; lines of several series leave no room for a third score."""
+    """Draw the figure of an ablation; with several series, only two scores are shown."""
     points = []
     for variant, cell in zip(ablation.variants, cells, strict=True):
         scores = {"GEO F1": f1_interval(cell.tiles["geo"]), "iTOPO F1": f1_interval(cell.tiles["itopo"])}
@@ -136,7 +136,7 @@ def _write_page(
     notes: Mapping[str, str],
     output: Path,
 ) -> None:
-    """Write the page, and the cells behind it."""
+    """Write the page, and the cells from which it is made."""
     first = ablations[0]
     made = dict(zip((variant.label for variant in first.variants), cells[first.name], strict=True))
     base = made.get(first.default, cells[first.name][0])
@@ -164,13 +164,13 @@ def _write_page(
 
 
 def _section(name: str, title: str, table: str, notes: Mapping[str, str]) -> str:
-    """Lay out what the page says about one ablation."""
+    """Return the text of the page about one ablation."""
     parts = [f"## {title}", notes.get(name, "").strip(), f"![{title}]({name}.png)", table]
     return "\n\n".join(part for part in parts if part)
 
 
 def _tables(ablation: Ablation, cells: Sequence[Cell]) -> str:
-    """Write a table for every series; each is compared with its own default, if it has one."""
+    """Return a table for every series; each is compared with its own default, if it has one."""
     pairs = list(zip(ablation.variants, cells, strict=True))
     tables = []
     for series in dict.fromkeys(variant.series for variant in ablation.variants):
@@ -182,7 +182,7 @@ def _tables(ablation: Ablation, cells: Sequence[Cell]) -> str:
 
 
 def _read_losses(path: Path) -> dict[str, dict[str, Any]]:
-    """Read the runs that differ in their loss, by label."""
+    """Read the results of the runs with different losses, by label."""
     try:
         runs = json.loads(path.read_text(encoding="utf-8"))
         losses = {label: runs[run] for run, label in _LOSSES.items() if run in runs}
@@ -201,7 +201,7 @@ def _loss_points(losses: Mapping[str, Mapping[str, Any]]) -> list[Point]:
 
 
 def _loss_table(losses: Mapping[str, Mapping[str, Any]]) -> str:
-    """Write what each loss gives on the validation squares of the training."""
+    """Return the table of the results of each loss on the validation squares of the training."""
     rows = [
         [point.label, *(f"{score.value:.3f}" for score in point.scores.values()), str(losses[point.label]["steps"])]
         for point in _loss_points(losses)
@@ -210,7 +210,7 @@ def _loss_table(losses: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def _read_notes(path: Path) -> dict[str, str]:
-    """Read what is to be said about ablations; nothing where there is no file."""
+    """Read the remarks on ablations; none if the file is missing."""
     if not path.exists():
         return {}
     try:
@@ -220,5 +220,5 @@ def _read_notes(path: Path) -> dict[str, str]:
 
 
 def _exact(value: float | None) -> Interval:
-    """Return a figure that has no interval; 0 where it is not defined."""
+    """Return a figure without an interval; 0 if it is not defined."""
     return Interval(value or 0.0, value or 0.0, value or 0.0)

@@ -1,4 +1,4 @@
-"""What is varied beyond the paper: each ablation changes one thing of the default method or of its data."""
+"""The ablations beyond the paper: each one changes one thing in the default method or in its data."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ class AblationValue:
 
     @property
     def like(self) -> Method | None:
-        """Method that has the same segmentation, if there is another one."""
+        """Return the method with the same segmentation, if there is another one."""
         return None if self.method.name in METHODS else BASE
 
 
 @dataclass(frozen=True)
 class Ablation:
-    """One thing, with the values that it is tried with."""
+    """One property of the method or the data, with the values to try."""
 
     name: str
     title: str
@@ -63,7 +63,7 @@ class Ablation:
 
 
 def find_ablations(names: Sequence[str], source: Source) -> list[Ablation]:
-    """Return ablations by name, in the order of the names; all of them where there is none.
+    """Return ablations by name, in the order of the names; all if no name is given.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def find_ablations(names: Sequence[str], source: Source) -> list[Ablation]:
 
 
 def vary(name: str, table: Table) -> Method:
-    """Return the default method with other options; the default method itself where they are none.
+    """Return the default method with other options; without any, the default method itself.
 
     Parameters
     ----------
@@ -118,12 +118,12 @@ def vary(name: str, table: Table) -> Method:
 
 
 def _graph_only(method: Method) -> Method:
-    """Leave out what else is scored of a method."""
+    """Return a method of which only the graph is scored."""
     return replace(method, mask=False, stages={})
 
 
 def _threshold(source: Source) -> Ablation:
-    """Vary how probable a pixel of the mask must be; the default is the network's own."""
+    """Vary the probability threshold of the mask; the default is that of the network."""
     own = read_weights(shipped_weights(points=BASE.points)).info.threshold
     tables = {
         f"{value:g}": {} if value == own else {"mask": {"threshold": value, "seed_threshold": value}}
@@ -133,13 +133,13 @@ def _threshold(source: Source) -> Ablation:
 
 
 def _collapse(source: Source) -> Ablation:
-    """Vary up to which length edges between junctions are collapsed."""
+    """Vary the length up to which edges between junctions are collapsed."""
     tables = {f"{value}": {"clean": {"short_edge": value}} for value in _LENGTHS}
     return _of_options("collapse", "Collapse length", "length, m", tables, source)
 
 
 def _traces(source: Source) -> Ablation:
-    """Vary the N of the gaps, which is built, and the N of the reference, which is scored against."""
+    """Vary the N of the gaps, which changes the build, and the N of the reference, which changes the score."""
     tables = {f"{value}": {"refinement": {"min_traces": value}} for value in _COUNTS}
     gaps = _of_options("traces", "Drives that a road needs, N", "N", tables, source)
     roads = [
@@ -161,13 +161,13 @@ def _alpha(source: Source) -> Ablation:
 
 
 def _thinning(source: Source) -> Ablation:
-    """Vary how the mask becomes lines."""
+    """Vary the method that turns the mask into lines."""
     tables: dict[str, Table] = {"Guo-Hall": {}, "Zhang-Suen": {"thinning": "zhang_suen"}}
     return _of_options("thinning", "Thinning", "algorithm", tables, source, joined=False)
 
 
 def _junctions(source: Source) -> Ablation:
-    """Vary how false junctions are split."""
+    """Vary the method that splits false junctions."""
     rules: dict[str, Table] = {
         "none": _NO_SPLIT, "literal": {"variant": "literal"}, "guarded, no heights": _NO_HEIGHTS, "guarded": {}
     }  # fmt: skip
@@ -176,19 +176,19 @@ def _junctions(source: Source) -> Ablation:
 
 
 def _poses(source: Source) -> Ablation:
-    """Vary how well drives agree; poses that the data set lacks and that cannot be made are left out."""
+    """Vary how well the drives agree; poses that are missing and cannot be made are left out."""
     sources = [replace(source, poses=poses) for poses in reversed(POSES)]
     variants = [AblationValue(one.poses, one, BASE) for one in sources if one.poses == source.poses or _can_be_had(one)]
     return Ablation("poses", "Poses", "poses", variants, source.poses, joined=False)
 
 
 def _can_be_had(source: Source) -> bool:
-    """Tell whether a fleet is there, or what makes it is installed."""
+    """Tell whether a fleet exists, or the package that makes it is installed."""
     return source.fleet_file.exists() or (source.poses == "aligned" and find_spec("gtsam") is not None)
 
 
 def _drives(source: Source) -> Ablation:
-    """Vary how many drives a road has; what is scored against stays."""
+    """Vary the number of drives of each road; the reference stays the same."""
     sources = {f"{count}": replace(source, drives=count) for count in _DRIVES} | {"all": source}
     variants = [
         AblationValue(label, one, METHODS[name] if one is source else _graph_only(METHODS[name]), series)
@@ -201,7 +201,7 @@ def _drives(source: Source) -> Ablation:
 def _of_options(
     name: str, title: str, axis: str, tables: Mapping[str, Table], source: Source, *, joined: bool = True
 ) -> Ablation:
-    """Return the ablation of an option from labels and what each sets; the default sets nothing new."""
+    """Return the ablation of an option from labels and the values to set; the default sets no value."""
     methods = {label: vary(f"{name}-{label}".translate(_FOLDER), table) for label, table in tables.items()}
     default = next(label for label, method in methods.items() if method is BASE)
     variants = [AblationValue(label, source, method) for label, method in methods.items()]

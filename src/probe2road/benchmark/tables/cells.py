@@ -1,4 +1,4 @@
-"""One method on one data set: built in a process of its own, scored area by area, and kept in files.
+"""The result of one method on one data set: built in a separate process, scored by area, and stored in files.
 
 Strategy: all is kept under the folder of the work, in `DATASET-POSES/METHOD/`: the workspace of the build, the graph,
 what it took, and its scores. Each file names the key that made it: method, options, weights, data set, poses, version.
@@ -65,13 +65,13 @@ class Cell:
     key: Mapping[str, Any]  # what made it
 
     def as_row(self) -> dict[str, Any]:
-        """Lay the cell out as a row of a table, with the configuration that made it."""
+        """Return the cell as a row of a table, with the configuration that made it."""
         names = {"area": self.area, "method": self.method, "stage": self.stage, "poses": self.poses}
         return {**names, **self.figures, "config": json.dumps(dict(self.key))}
 
 
 def build_cell(source: Source, method: Method, *, like: Method | None = None) -> Path:
-    """Build the graph of a method, unless it is there; returns its folder.
+    """Build the graph of a method, unless it exists; return its folder.
 
     Parameters
     ----------
@@ -102,12 +102,12 @@ def build_cell(source: Source, method: Method, *, like: Method | None = None) ->
 
 
 def read_built(source: Source, method: Method) -> RoadGraph:
-    """Return the graph that `build_cell` made."""
+    """Return the graph that `build_cell` has made."""
     return read_graph(build_cell(source, method) / _GRAPH)
 
 
 def score_cells(source: Source, method: Method) -> list[Cell]:
-    """Score what `build_cell` made: every stage in every area."""
+    """Score the results of `build_cell`: every stage in every area."""
     folder = build_cell(source, method)
     built = _read(folder / _RECORD) or {}
     key = {**built["key"], "min_drives": source.min_drives}
@@ -131,7 +131,7 @@ def score_cells(source: Source, method: Method) -> list[Cell]:
 def score_graph(
     graph: RoadGraph, reference: RoadGraph, *, area: shapely.Geometry | None = None
 ) -> tuple[dict[str, pd.DataFrame], dict[str, float | None]]:
-    """Score a graph in all metrics of the tables.
+    """Score a graph with all metrics of the tables.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def score_graph(
 
 
 def write_cells(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write rows of `Cell.as_row` as CSV; what a row does not have stays empty."""
+    """Write rows of `Cell.as_row` as CSV; missing values stay empty."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
@@ -164,7 +164,7 @@ def write_cells(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _key(source: Source, method: Method) -> dict[str, Any]:
-    """Everything that decides what a build gives, as JSON has it."""
+    """Return all that determines the result of a build, as JSON."""
     key = {
         "method": method.name,
         "options": asdict(method.options),
@@ -182,7 +182,7 @@ def _key(source: Source, method: Method) -> dict[str, Any]:
 
 
 def _build(method: Method, path: Path, folder: Path) -> float:
-    """Read, build and write; returns the seconds that the build took."""
+    """Read the fleet, build the graph and write it; return the seconds of the build."""
     fleet = read_fleet(path, points_path(path) if method.points else None)
     started = time.perf_counter()
     graph = method.builder(fleet, options=method.options, workspace=folder / STAGES)
@@ -192,7 +192,7 @@ def _build(method: Method, path: Path, folder: Path) -> float:
 
 
 def _score(source: Source, method: Method, folder: Path, stage: str, area: str) -> dict[str, Any]:
-    """Score one graph, and its mask, in one area, for a file."""
+    """Score one graph, and its mask, in one area; return the content of a file."""
     path = folder / _GRAPH if stage == FULL else folder / STAGES / method.stages[stage].file()
     extent = source.areas[area]
     tiles, figures = score_graph(read_graph(path), source.reference, area=extent)
@@ -204,7 +204,7 @@ def _score(source: Source, method: Method, folder: Path, stage: str, area: str) 
 
 
 def _rows(table: pd.DataFrame) -> list[list[Any]]:
-    """Lay a table of counts out for JSON."""
+    """Return a table of counts in a form for JSON."""
     return [[tile, *map(int, counts)] for tile, *counts in table[COUNTS].itertuples()]
 
 

@@ -1,4 +1,4 @@
-"""The counts behind a score, tile by tile: what intervals are made from.
+"""The counts behind a score, tile by tile, from which intervals are computed.
 
 Strategy: the metrics run over the whole area, and only then is each sample, junction or pixel put down to the tile of
 one square kilometre that it lies in. So nothing is cut at the borders of tiles, and the counts of all tiles add up to
@@ -21,8 +21,8 @@ from probe2road.metrics.geo import GeoOptions, geo_samples
 from probe2road.metrics.itopo import ItopoOptions, itopo_pairs
 from probe2road.metrics.network import Network
 from probe2road.metrics.soft_f1 import soft_f1
+from probe2road.raster.drawing import label_mask
 from probe2road.raster.grid import Grid
-from probe2road.raster.lines import label_mask
 
 __all__ = ["geo_counts", "itopo_counts", "soft_counts"]
 
@@ -54,7 +54,7 @@ def geo_counts(proposal: Network, reference: Network, options: GeoOptions | None
 
 
 def itopo_counts(proposal: Network, reference: Network, options: ItopoOptions | None = None) -> pd.DataFrame:
-    """Count the samples of iTOPO in each tile; a pair lies where its node does. See `geo_counts`."""
+    """Count the samples of iTOPO in each tile; a pair belongs to the tile of its node. See `geo_counts`."""
     pairs = itopo_pairs(proposal, reference, options=options or ItopoOptions())
     tables = [
         _tiles(
@@ -113,7 +113,7 @@ def soft_counts(
 
 
 def _inside(area: shapely.Geometry | None, grid: Grid, window: tuple[slice, slice]) -> NDArray[np.bool_] | np.bool_:
-    """Mark the pixels of a window whose centre lies in an area; all of them where there is no area."""
+    """Mark the pixels of a window whose centre lies in an area; all pixels if there is no area."""
     if area is None:
         return np.True_
     rows, cols = (part.indices(size) for part, size in zip(window, grid.shape, strict=True))
@@ -123,7 +123,7 @@ def _inside(area: shapely.Geometry | None, grid: Grid, window: tuple[slice, slic
 
 
 def _tiles(xy: NDArray[np.float64], **counts: NDArray[np.generic]) -> pd.DataFrame:
-    """Lay counts of places out with the tile of each."""
+    """Return the counts of places in a table, with the tile of each place."""
     column, row = np.floor(xy / TILE_SIZE).astype(np.int64).T
     return pd.DataFrame(
         {"column": column, "row": row, **{name: part.astype(np.int64) for name, part in counts.items()}}
@@ -131,7 +131,7 @@ def _tiles(xy: NDArray[np.float64], **counts: NDArray[np.generic]) -> pd.DataFra
 
 
 def _pooled(table: pd.DataFrame) -> pd.DataFrame:
-    """Add up what lies in one tile."""
+    """Sum the counts of each tile."""
     sums = table.groupby(["column", "row"]).sum().reindex(columns=COUNTS, fill_value=0).astype(np.int64)
     sums.index = pd.Index([f"{column}_{row}" for column, row in sums.index], name="tile")
     return sums

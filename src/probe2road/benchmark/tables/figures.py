@@ -25,7 +25,7 @@ _APART = 0.12  # how far the points of a series stand beside those of the one be
 
 @dataclass(frozen=True)
 class Point:
-    """One value of an option, scored."""
+    """One value of an option, with its scores."""
 
     label: str
     scores: Mapping[str, Interval]  # by name
@@ -35,7 +35,7 @@ class Point:
 def draw_points(
     path: Path, points: Sequence[Point], *, title: str, axis: str = "", default: str = "", joined: bool = True
 ) -> None:
-    """Draw scores over values, which stand side by side in the order in which they come.
+    """Draw scores over the values of an option, in the given order.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def _draw_score(
 
 
 def _style(axes: Axes, scores: Sequence[str], series: Sequence[str]) -> None:
-    """Frame the axes thinly, and say below the title what has which colour and line."""
+    """Draw a thin frame, and explain the colours and lines below the title."""
     from matplotlib.lines import Line2D
 
     axes.grid(axis="y", color=FRAME, linewidth=0.5)

@@ -1,4 +1,4 @@
-"""How far a score would move on other tiles of the same roads: bootstrap over tiles.
+"""Confidence intervals: how much a score would change on other tiles of the same roads, by bootstrap over tiles.
 
 Strategy: a score pools counts over tiles, so drawing tiles with replacement is drawing how often each tile counts. All
 draws are one matrix product. Two methods on the same tiles are compared draw by draw: what makes a tile hard is
@@ -24,7 +24,7 @@ _SEED = 20120101
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure and the interval about it."""
+    """A figure and its interval."""
 
     value: float
     low: float
@@ -32,7 +32,7 @@ class Interval:
 
 
 def f1_interval(tiles: pd.DataFrame, *, draws: int = DRAWS, level: float = _LEVEL) -> Interval:
-    """Return F1 over all tiles, and the interval in which it lies when tiles are drawn anew.
+    """Return F1 over all tiles, and its interval from tiles drawn with replacement.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def f1_interval(tiles: pd.DataFrame, *, draws: int = DRAWS, level: float = _LEVE
 def difference_interval(
     ours: pd.DataFrame, theirs: pd.DataFrame, *, draws: int = DRAWS, level: float = _LEVEL
 ) -> Interval:
-    """Return by how much one F1 is above another, and the interval when the same tiles are drawn anew for both.
+    """Return the difference of two F1, and its interval from the same drawn tiles for both.
 
     Parameters
     ----------
@@ -85,13 +85,13 @@ def difference_interval(
 
 
 def _weights(n: int, draws: int) -> NDArray[np.float64]:
-    """How often each tile is drawn, shape (draws, n)."""
+    """Return how often each tile is drawn, shape (draws, n)."""
     rng = np.random.default_rng(_SEED)
     return rng.multinomial(n, np.full(n, 1.0 / n), size=draws).astype(np.float64)
 
 
 def _f1(sums: NDArray[np.float64]) -> NDArray[np.float64]:
-    """F1 of pooled counts, shape (draws, 4) to (draws,)."""
+    """Return F1 of pooled counts: shape (draws, 4) to (draws,)."""
     precision, recall = (
         np.divide(sums[:, part], sums[:, part + 1], out=np.zeros(len(sums)), where=sums[:, part + 1] > 0)
         for part in (0, 2)

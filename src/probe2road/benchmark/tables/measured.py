@@ -1,4 +1,4 @@
-"""A call in a process of its own: its result, its seconds, and its peak memory."""
+"""A function call in a separate process: its result, its seconds, and its peak memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Measured(Generic[T]):
-    """What a call returned and what it took."""
+    """The result of a call, and its time and memory."""
 
     result: T
     seconds: float  # wall time
@@ -25,7 +25,7 @@ class Measured(Generic[T]):
 
 
 def measure(function: Callable[..., T], *arguments: Any) -> Measured[T]:
-    """Call a function in a fresh process.
+    """Call a function in a new process, and measure it.
 
     Parameters
     ----------
@@ -43,13 +43,13 @@ def measure(function: Callable[..., T], *arguments: Any) -> Measured[T]:
 
 
 def _run(function: Callable[..., T], *arguments: Any) -> Measured[T]:
-    """Call and measure here."""
+    """Call a function in this process, and measure it."""
     started = time.perf_counter()
     result = function(*arguments)
     return Measured(result, time.perf_counter() - started, _peak_megabytes())
 
 
 def _peak_megabytes() -> float:
-    """Peak memory of this process; what getrusage says starts from that of the parent."""
+    """Return the peak memory of this process; that of getrusage would include the parent's."""
     line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) / 1024

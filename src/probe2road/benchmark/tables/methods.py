@@ -1,4 +1,4 @@
-"""The methods of the paper's tables: what each is called, what it sees, and how it builds."""
+"""The methods in the paper's tables: their names, their input, and how they build."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["METHODS", "Method", "find_methods"]
 
 @dataclass(frozen=True)
 class Method:
-    """A way from fleet data to a road graph, as it stands in a row of a table."""
+    """A method from fleet data to a road graph, as in a row of a table."""
 
     name: str
     label: str
@@ -34,7 +34,7 @@ class Method:
 
     @property
     def weights(self) -> Path | None:
-        """File of the network that the method runs, if it runs one."""
+        """Return the weights file of the method's network, if it has one."""
         if isinstance(self.options, DeepMGOptions):
             return Path(self.options.weights)
         if isinstance(self.options, BuildOptions) and self.options.segmentation.segmenter == "network":
@@ -63,7 +63,7 @@ METHODS: dict[str, Method] = {
 
 
 def find_methods(names: Sequence[str], *, deepmg: str | Path | None = None) -> list[Method]:
-    """Return methods by name, in the order of the names; all of them where there is none.
+    """Return methods by name, in the order of the names; all if no name is given.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ Bounds = tuple[float, float, float, float]
 
 
 def busiest_places(reference: RoadGraph, count: int, *, size: float = 700.0) -> list[Bounds]:
-    """Return the squares with the most junctions of a reference, none over another.
+    """Return the squares with the most junctions of a reference, without overlap.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def busiest_places(reference: RoadGraph, count: int, *, size: float = 700.0) -> 
 
 
 def draw_place(path: Path, bounds: Bounds, fleet: Fleet, reference: RoadGraph, graphs: Mapping[str, RoadGraph]) -> None:
-    """Draw traces, and each graph over the reference, side by side.
+    """Draw the traces of a place, and each graph over the reference, side by side.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def draw_place(path: Path, bounds: Bounds, fleet: Fleet, reference: RoadGraph, g
 
 
 def _within(graph: RoadGraph, bounds: Bounds) -> RoadGraph:
-    """Keep the edges that touch an area, whole, and their nodes."""
+    """Keep the edges that touch an area, uncut, and their nodes."""
     touching = graph.edges.geometry.intersects(shapely.box(*bounds)).to_numpy()
     edges = graph.edges[touching]
     used = np.union1d(edges["u"], edges["v"])
@@ -89,7 +89,7 @@ def _within(graph: RoadGraph, bounds: Bounds) -> RoadGraph:
 
 
 def _neighbours(xy: NDArray[np.float64], reach: float) -> NDArray[np.int64]:
-    """Count the points within a square about each point, shape (K,)."""
+    """Count the points within a square around each point, shape (K,)."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(xy)

@@ -1,4 +1,4 @@
-"""What the paper reports in its tables, to stand beside our numbers.
+"""The numbers in the paper's tables, for comparison with ours.
 
 Its data are private and other than ours, so only order and magnitude can be compared.
 """
@@ -12,7 +12,7 @@ __all__ = ["METHODS_TABLE", "SOFT_F1_TABLE", "STAGES_TABLE", "VISION_TABLE", "Tr
 
 
 class Triple(NamedTuple):
-    """One metric in a row of the paper."""
+    """Precision, recall and F1 of one metric in a row of the paper."""
 
     precision: float
     recall: float

@@ -1,4 +1,4 @@
-"""One command for all tables: build, score, and write what the paper's tables show, on open data."""
+"""The run of all tables: build, score, and write the paper's tables for open data."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def run_benchmark(
     deepmg
         File of DeepMG's weights; without it the method is left out.
     progress
-        Called as the work goes on.
+        Called during the work with the progress of each stage.
 
     Returns
     -------
@@ -108,7 +108,7 @@ def run_benchmark(
 
 
 def _write_tables(cells: Sequence[Cell], output: Path, poses: str) -> None:
-    """Write all tables, and the cells behind them."""
+    """Write all tables, and the cells from which they are made."""
     areas = list(dict.fromkeys(cell.area for cell in cells))
     us = [area for area in areas if area.startswith(("columbus", "boston"))]
     others = [area for area in areas if area not in us]
@@ -135,7 +135,7 @@ def _write_tables(cells: Sequence[Cell], output: Path, poses: str) -> None:
 
 
 def _draw_places(source: Source, methods: Sequence[Method], output: Path) -> None:
-    """Draw the busiest places of a city that only tests."""
+    """Draw the busiest places of a city that is only used for tests."""
     if find_dataset(source.name).splits:
         return
     graphs = {method.label: read_built(source, method) for method in methods}

@@ -1,4 +1,4 @@
-"""The fleet data of a comparison: a prepared data set, with the poses and as many drives as are asked for."""
+"""The fleet data of a comparison: a prepared data set, with given poses and number of drives."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _SEED = 64
 @dataclass(frozen=True)
 @checked
 class Source:
-    """A prepared data set, which of its fleets and roads are taken, and where the work on it is kept."""
+    """A prepared data set, which of its fleets and roads to use, and the folder for results."""
 
     folder: Path
     work: Path
@@ -50,23 +50,23 @@ class Source:
 
     @property
     def name(self) -> str:
-        """Of the data set."""
+        """Return the name of the data set."""
         return self.folder.name
 
     @property
     def place(self) -> Path:
-        """Folder of all that is made from this fleet."""
+        """Return the folder for all results from this fleet."""
         return self.work / (f"{self.name}-{self.poses}" + ("" if self.drives is None else f"-{self.drives}"))
 
     @cached_property
     def digest(self) -> str:
-        """Of the whole data set: its manifest holds the checksums of all files."""
+        """Return a digest of the whole data set, from its manifest with the checksums of all files."""
         check_dataset(self.folder)
         return hashlib.sha256((self.folder / "manifest.json").read_bytes()).hexdigest()[:16]
 
     @property
     def aligned_digest(self) -> str | None:
-        """Of the aligned fleet, which is no part of the data set as it was prepared; None for other poses."""
+        """Return a digest of the aligned fleet, which is not in the manifest; None for other poses."""
         if self.poses != "aligned":
             return None
         with Recording(self.folder).aligned.open("rb") as file:
@@ -74,17 +74,17 @@ class Source:
 
     @cached_property
     def driven(self) -> RoadGraph:
-        """The true road graph with the true number of drives."""
+        """Return the true road graph with the true numbers of drives."""
         return read_graph(Recording(self.folder).reference)
 
     @cached_property
     def reference(self) -> RoadGraph:
-        """The roads that enough drives of the whole fleet passed."""
+        """Return the roads that enough drives of the whole fleet passed."""
         return labelled_reference(self.driven, min_drives=self.min_drives)
 
     @cached_property
     def areas(self) -> dict[str, shapely.Geometry | None]:
-        """Name and extent of what is scored: the splits, or the whole."""
+        """Return the name and extent of each area to score: the splits, or the whole."""
         if not find_dataset(self.name).splits:
             return {self.name: None}
         tiles = read_tiles(self.folder)
@@ -92,14 +92,14 @@ class Source:
 
     @property
     def fleet_file(self) -> Path:
-        """Traces of the fleet; `make_fleet` makes what the data set does not have."""
+        """Return the file with the traces of the fleet; `make_fleet` makes it if the data set lacks it."""
         if self.drives is None:
             return Recording(self.folder).traces(self.poses)
         return self.place / "fleet.parquet"
 
 
 def make_fleet(source: Source) -> None:
-    """Align the raw fleet, or choose drives of a fleet, where the files are missing.
+    """Align the raw fleet, or choose drives from a fleet, if the files are missing.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def make_fleet(source: Source) -> None:
 
 
 def choose_drives(routes: pd.DataFrame, most: int, *, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Choose drives so that a road has about as many as asked for, wherever the fleet has them.
+    """Choose drives so that each road has about the given number of them, if the fleet has enough.
 
     Drives are taken in random order, each one that passes a road which has not got enough yet. A road on the way of
     many others ends up with more.
@@ -163,6 +163,6 @@ def choose_drives(routes: pd.DataFrame, most: int, *, rng: np.random.Generator) 
 
 
 def _of_drives(fleet: Fleet, drives: NDArray[np.int64]) -> Fleet:
-    """Keep some of the drives."""
+    """Return a fleet with only the given drives."""
     kept = [table[table["trace_id"].isin(drives)].reset_index(drop=True) for table in (fleet.traces, fleet.points)]
     return Fleet(kept[0], kept[1], fleet.crs)

@@ -27,7 +27,7 @@ _PAIR_HEADER = ["GEO P", "R", "F1", "iTOPO P", "R", "F1", "paper: GEO F1", "iTOP
 
 
 def methods_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
-    """Write Tables I and II: GEO and iTOPO of every method in some areas."""
+    """Return Tables I and II: GEO and iTOPO of every method in some areas."""
     rows = []
     for area in areas:
         for cell in _full(cells, area):
@@ -37,7 +37,7 @@ def methods_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
 
 
 def soft_table(cells: Sequence[Cell]) -> str:
-    """Write Table III: soft F1 of the masks of our own methods."""
+    """Return Table III: soft F1 of the masks of our own methods."""
     rows = []
     for cell in cells:
         if cell.stage != FULL or "soft_f1" not in cell.tiles:
@@ -50,7 +50,7 @@ def soft_table(cells: Sequence[Cell]) -> str:
 
 
 def vision_table(cells: Sequence[Cell], area: str) -> str:
-    """Write Table IV: the same network with and without the points of the camera."""
+    """Return Table IV: the same network with and without the points of the camera."""
     chosen = {cell.method: cell for cell in _full(cells, area)}
     rows = [
         [area, METHODS[name].label, *_pair(chosen[name]), *_paper_pair(paper if area == "boston" else None)]
@@ -61,7 +61,7 @@ def vision_table(cells: Sequence[Cell], area: str) -> str:
 
 
 def stages_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
-    """Write Table V: what each step of the post-processing gives."""
+    """Return Table V: the scores after each step of the post-processing."""
     rows = []
     for area in areas:
         for cell in (cell for cell in cells if cell.area == area and cell.method == _OURS):
@@ -71,7 +71,7 @@ def stages_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
 
 
 def difference_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
-    """Write by how much Probe2Road is ahead of each other method, tiles drawn for both alike."""
+    """Return the advantage of Probe2Road over each other method, with the same drawn tiles for both."""
     rows = []
     for area in areas:
         chosen = {cell.method: cell for cell in _full(cells, area)}
@@ -85,7 +85,7 @@ def difference_table(cells: Sequence[Cell], areas: Iterable[str]) -> str:
 
 
 def cost_table(cells: Sequence[Cell]) -> str:
-    """Write what stands beside the paper's metrics: other metrics, size, and what a build costs."""
+    """Return the table of other metrics, size, and the costs of a build."""
     names = ("topo_f1", "apls_f1", "junctions_f1")
     rows = []
     for cell in (cell for cell in cells if cell.stage == FULL):
@@ -104,7 +104,7 @@ def cost_table(cells: Sequence[Cell]) -> str:
 
 
 def ablation_table(axis: str, rows: Sequence[tuple[str, Cell, Cell]]) -> str:
-    """Write what values of an option give.
+    """Return the table of the scores for the values of an option.
 
     Parameters
     ----------
@@ -125,23 +125,23 @@ def ablation_table(axis: str, rows: Sequence[tuple[str, Cell, Cell]]) -> str:
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Write a table in Markdown."""
+    """Return a table in Markdown."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
 def _full(cells: Sequence[Cell], area: str) -> list[Cell]:
-    """Finished graphs in an area."""
+    """Return the cells of finished graphs in an area."""
     return [cell for cell in cells if cell.area == area and cell.stage == FULL]
 
 
 def _pair(cell: Cell, *, digits: int = 3) -> list[str]:
-    """GEO and iTOPO of a cell."""
+    """Return GEO and iTOPO of a cell as text."""
     return [text for metric in _GRAPH_METRICS for text in _triple(cell, metric, digits=digits)]
 
 
 def _triple(cell: Cell, metric: str, *, digits: int = 3) -> list[str]:
-    """Precision, recall and F1 with its interval."""
+    """Return precision, recall, and F1 with its interval, as text."""
     sums = cell.tiles[metric].sum()
     precision = ratio(sums["matched_proposal"], sums["proposal"])
     recall = ratio(sums["matched_reference"], sums["reference"])
@@ -154,5 +154,5 @@ def _with_interval(interval: Interval, *, sign: str = "", digits: int = 3) -> st
 
 
 def _paper_pair(paper: tuple[Triple, Triple] | None, *, digits: int = 3) -> list[str]:
-    """F1 of GEO and iTOPO as the paper has them."""
+    """Return F1 of GEO and iTOPO from the paper as text."""
     return ["", ""] if paper is None else [f"{triple.f1:.{digits}f}" for triple in paper]

@@ -1,4 +1,4 @@
-"""Gaps filled: dead ends and interrupted roads linked to what they were cut off from."""
+"""Gap filling: dead ends and interrupted roads linked to the roads that they were cut off from."""
 
 from pkgutil import iter_modules
 

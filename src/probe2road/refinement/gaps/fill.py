@@ -1,4 +1,4 @@
-"""Gap filling: connect dead ends to what they were probably cut off from, and let the traces decide what stays.
+"""Gap filling: link dead ends to the roads they were probably cut off from, and keep the links that traces drive.
 
 Strategy
 --------
@@ -69,7 +69,7 @@ def fill_gaps(graph: RoadGraph, *, options: GapOptions | None = None) -> RoadGra
     graph
         Any road graph.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def fill_jumps(graph: RoadGraph, steps: pd.DataFrame, *, options: GapOptions | N
     steps
         Matched paths on it: `probe2road.matching.match.Matches.steps`.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -178,7 +178,7 @@ def gap_weights(graph: RoadGraph, *, gap: float = 0.1) -> pd.Series:
 
 
 def prune_gaps(graph: RoadGraph, steps: pd.DataFrame, *, min_traces: int = 4) -> RoadGraph:
-    """Remove gap edges that too few traces drove through, and merge what they had split.
+    """Remove gap edges that too few traces drove through, and merge the edges that they had split.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def prune_gaps(graph: RoadGraph, steps: pd.DataFrame, *, min_traces: int = 4) ->
 
 
 def _chosen(ends: DeadEnds, links: Links, options: GapOptions) -> Links:
-    """Choose links from the shortest on, none like another at its node and not too many at a node."""
+    """Choose links, the shortest first: none similar to another at its node, and not too many at one node."""
     vector = links.target - ends.position[links.end]
     order = np.lexsort([*links.target.T, *ends.position[links.end].T, np.hypot(*vector.T).round(6)])
     at: dict[tuple[str, int, int], list[float]] = {}
@@ -239,13 +239,13 @@ def _chosen(ends: DeadEnds, links: Links, options: GapOptions) -> Links:
 
 
 def _has_room(bearings: list[float], bearing: float, options: GapOptions) -> bool:
-    """Tell whether a node with links at some bearings (degrees) takes one more."""
+    """Tell whether a node whose links have the given bearings (degrees) can take one more link."""
     near = any(abs((other - bearing + 180.0) % 360.0 - 180.0) < options.min_angle for other in bearings)
     return not near and len(bearings) < options.max_links
 
 
 def _with_links(graph: RoadGraph, ends: DeadEnds, links: Links) -> RoadGraph:
-    """Split edges where links lead into them, and add the links as edges."""
+    """Split the edges on which links end, and add the links as edges."""
     into = links.node == NO_NODE
     edge_ids = graph.edges.index.to_numpy()
     graph, made = split_edges(graph, edge_ids[links.edge[into]], links.along[into], merge=_NEW_NODE)
@@ -271,7 +271,7 @@ def _with_edges(graph: RoadGraph, u: NDArray[np.int64], v: NDArray[np.int64]) ->
 
 
 def _straight_lines(graph: RoadGraph, u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.object_]:
-    """Draw lines between nodes, with the heights that edges have there where edges have heights."""
+    """Draw straight lines between nodes, with heights taken from the edges there if the edges have heights."""
     edges = graph.edges
     lines = edges.geometry.to_numpy()
     if shapely.has_z(lines).any():

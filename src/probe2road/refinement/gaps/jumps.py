@@ -1,4 +1,4 @@
-"""Roads interrupted where traces go on: pairs of edge ends between which traces jump.
+"""Roads that are interrupted although traces continue: pairs of edge ends between which traces jump.
 
 Where a road passes over or under several others its mask is often lost for longer than geometry alone may bridge, and
 its ends have grown into the roads it crosses. Matched traces show that: they leave the graph at one edge end and are
@@ -19,7 +19,7 @@ __all__ = ["jumped_gaps"]
 
 
 def jumped_gaps(graph: RoadGraph, steps: pd.DataFrame, options: GapOptions) -> NDArray[np.int64]:
-    """List the pairs of nodes between which traces are not on the graph.
+    """List the pairs of nodes between which traces leave the graph.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def jumped_gaps(graph: RoadGraph, steps: pd.DataFrame, options: GapOptions) -> N
     steps
         Paths matched on it: `probe2road.matching.match.Matches.steps`.
     options
-        Of which ``max_jump``, ``min_jumps``, ``jump_turn`` and ``heading_length`` are used.
+        Only ``max_jump``, ``min_jumps``, ``jump_turn`` and ``heading_length`` are used.
 
     Returns
     -------

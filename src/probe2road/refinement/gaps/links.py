@@ -1,4 +1,4 @@
-"""Links across gaps: what a dead end may have been cut off from.
+"""Links across gaps: the places that a dead end may have been cut off from.
 
 Strategy
 --------
@@ -34,11 +34,11 @@ __all__ = [
     "within_reach",
 ]
 
-NO_NODE = -1  # node of a link that leads into an edge
+NO_NODE = -1  # node of a link that ends on an edge
 
 _ALONG = 45.0  # degrees; an edge beside a dead end runs along it when the two directions differ by less
-_TURN = 45.0  # degrees that count like the distance once more
-_LEAD = 2.0  # times the distance aside, by which a link to an edge beside leads ahead: it leaves by about 27 degrees
+_TURN = 45.0  # degrees of turn that count as much as the distance itself
+_LEAD = 2.0  # times the lateral distance that a link to a parallel edge leads ahead: it leaves at about 27 degrees
 _TOUCH = 0.05  # m; a link is not tested for crossings nearer than this to its ends
 
 
@@ -48,15 +48,15 @@ class GapOptions:
     """Which gaps are filled (METHOD 3.6, 0.1 rows 16 to 18)."""
 
     max_length: NotNegative[float] = 50.0  # m; longer links are never made
-    snap: NotNegative[float] = 15.0  # m; a hit this near to the end of its edge goes to the node there
-    beside: NotNegative[float] = 20.0  # m; a dead end is led into an edge that runs along it this near; 0 leaves it
+    snap: NotNegative[float] = 15.0  # m; a link that hits an edge this near to its end goes to the node there
+    beside: NotNegative[float] = 20.0  # m; a dead end is linked to a parallel edge this near; 0: none
     max_turn: NotNegative[float] = 90.0  # degrees, between road and link, at both ends of a link between dead ends
     min_angle: NotNegative[float] = 20.0  # degrees; of two links at one node that differ by less, the shorter is made
     heading_length: Positive[float] = 15.0  # m, over which the direction of a dead end is measured
     max_links: NotNegative[int] = 2  # links at one node
     stem_turn: NotNegative[float] = 20.0  # degrees, at both ends of a link between junctions face to face; 0: none
     max_jump: NotNegative[float] = 100.0  # m, between edge ends that are joined because traces jump across; 0: none
-    min_jumps: NotNegative[int] = 2  # traces that must
+    min_jumps: NotNegative[int] = 2  # fewest traces that must jump
     jump_turn: NotNegative[float] = 60.0  # degrees, between road and link, at both of its ends
 
 
@@ -87,7 +87,7 @@ class Links:
 
 
 def dead_ends(graph: RoadGraph, reach: float) -> DeadEnds:
-    """Collect the ends of edges at nodes of degree 1, their directions measured over a length (m) or the whole edge.
+    """Collect the ends of edges at nodes of degree 1, with directions measured over a length (m) or the whole edge.
 
     An edge that curls back onto its end within that length has no direction there, and is left out.
     """
@@ -98,7 +98,7 @@ def dead_ends(graph: RoadGraph, reach: float) -> DeadEnds:
 
 
 def to_dead_ends(ends: DeadEnds, options: GapOptions) -> Links:
-    """Link every dead end to the nearest one that lies ahead of it and that it lies ahead of.
+    """Link every dead end to the nearest dead end, if each of the two lies ahead of the other.
 
     A turn counts like a detour, each 45 degrees like the distance once more: where two interrupted roads cross, their
     four ends are joined across and not around the corner.
@@ -120,12 +120,12 @@ def to_dead_ends(ends: DeadEnds, options: GapOptions) -> Links:
 def straight_on(
     graph: RoadGraph, lines: NDArray[np.object_], tree: shapely.STRtree, ends: DeadEnds, options: GapOptions
 ) -> Links:
-    """Link every dead end to what its straight extension hits first."""
+    """Link every dead end to the first edge that its straight extension hits."""
     far = ends.position + options.max_length * ends.ahead
     rays = shapely.linestrings(np.stack([ends.position, far], axis=1))
     end, edge = tree.query(rays, predicate="intersects")
     hits = shapely.intersection(rays[end], lines[edge])
-    places, pair = shapely.get_coordinates(hits, return_index=True)  # of a stretch in common, both ends
+    places, pair = shapely.get_coordinates(hits, return_index=True)  # both ends of a common stretch
     end, edge = end[pair], edge[pair]
     distance = ((places - ends.position[end]) * ends.ahead[end]).sum(axis=1)
     along = shapely.line_locate_point(lines[edge], shapely.points(places))
@@ -139,7 +139,7 @@ def straight_on(
 def to_edges_beside(
     graph: RoadGraph, lines: NDArray[np.object_], tree: shapely.STRtree, ends: DeadEnds, options: GapOptions
 ) -> Links:
-    """Link every dead end to the nearest edge that runs along it, ahead by twice the distance between them.
+    """Link every dead end to the nearest parallel edge, at a place ahead by twice the distance between the two.
 
     A ramp's end is nearly parallel to the mainline. Its straight extension would reach it far ahead, or never.
     """
@@ -159,13 +159,13 @@ class _EdgesNear:
     end: NDArray[np.int64]  # (n,) row of the dead end
     edge: NDArray[np.int64]  # (n,) row of the edge
     foot: NDArray[np.float64]  # (n, 2) m, from the dead end to the nearest place of the edge
-    aside: NDArray[np.float64]  # (n,) m, length of that
-    along: NDArray[np.float64]  # (n,) m from the start of the edge, where a link would lead
-    target: NDArray[np.float64]  # (n, 2) m, that place
+    aside: NDArray[np.float64]  # (n,) m, length of foot
+    along: NDArray[np.float64]  # (n,) m from the start of the edge to where a link would end
+    target: NDArray[np.float64]  # (n, 2) m, place where a link would end
 
 
 def _edges_near(lines: NDArray[np.object_], tree: shapely.STRtree, ends: DeadEnds, distance: float) -> _EdgesNear:
-    """Pair dead ends with the edges up to a distance (m) from them, and find where links would lead."""
+    """Pair dead ends with the edges within a distance (m), and find the places on the edges where links would end."""
     points = shapely.points(ends.position)
     end, edge = tree.query(points, predicate="dwithin", distance=distance)
     nearest = shapely.line_interpolate_point(lines[edge], shapely.line_locate_point(lines[edge], points[end]))
@@ -178,7 +178,7 @@ def _edges_near(lines: NDArray[np.object_], tree: shapely.STRtree, ends: DeadEnd
 
 
 def _runs_along(lines: NDArray[np.object_], ends: DeadEnds, near: _EdgesNear) -> NDArray[np.bool_]:
-    """Tell which edges run along the dead end beside them, shape (n,)."""
+    """Tell which edges are parallel to the dead end beside them, shape (n,)."""
     ahead = ends.ahead[near.end]
     slope = angle_between(ahead, _directions(lines[near.edge], near.along))
     return np.asarray(
@@ -197,7 +197,7 @@ def _apart_on_edge(
     along: NDArray[np.float64],
     least: float,
 ) -> NDArray[np.bool_]:
-    """Tell which places are on another edge than the dead end itself, or far from it along its own."""
+    """Tell which places lie on another edge than the dead end itself, or far away along the same edge."""
     own = ends.edge[end] == edge
     from_end = np.where(ends.at_start[end], along, shapely.length(lines[edge]) - along)
     return np.asarray(~own | (from_end > 2 * least))
@@ -211,7 +211,7 @@ def _snapped(
     along: NDArray[np.float64],
     snap: float,
 ) -> Links:
-    """Lead links to places on edges, or to the nearer end node of an edge within ``snap``."""
+    """Return links to places on edges, or to the nearer end node of the edge if it is within ``snap``."""
     length = shapely.length(lines[edge])
     at_start = along <= length - along
     snapped = np.minimum(along, length - along) <= snap
@@ -226,7 +226,7 @@ def within_reach(ends: DeadEnds, links: Links, options: GapOptions) -> Links:
     vector = links.target - ends.position[links.end]
     length = np.hypot(*vector.T)
     turn = angle_between(ends.ahead[links.end], vector)
-    # A link into a dead end turns there too, by whatever rule it came about.
+    # A link that ends at a dead end turns there too, whichever rule proposed it.
     of_node = pd.Series(np.arange(len(ends.node)), index=ends.node).groupby(level=0).first()
     other = of_node.reindex(links.node).to_numpy(np.float64)
     into = np.isfinite(other)
@@ -236,7 +236,7 @@ def within_reach(ends: DeadEnds, links: Links, options: GapOptions) -> Links:
 
 
 def crosses(graph: RoadGraph, tree: shapely.STRtree, ends: DeadEnds, links: Links) -> NDArray[np.bool_]:
-    """Tell which links meet an edge between their ends; edges at the node that they lead to are not asked."""
+    """Tell which links cross an edge between their ends, ignoring the edges at the node where the link ends."""
     start = ends.position[links.end]
     vector = links.target - start
     length = np.maximum(np.hypot(*vector.T), 2 * _TOUCH)[:, None]
@@ -252,14 +252,14 @@ def crosses(graph: RoadGraph, tree: shapely.STRtree, ends: DeadEnds, links: Link
 
 
 def _directions(lines: NDArray[np.object_], along: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return vectors along lines, over 2 m around places on them, shape (n, 2)."""
+    """Return the direction vectors of lines at places on them, measured over 2 m, shape (n, 2)."""
     before = shapely.line_interpolate_point(lines, np.maximum(along - 1.0, 0.0))
     after = shapely.line_interpolate_point(lines, np.minimum(along + 1.0, shapely.length(lines)))
     return np.asarray(shapely.get_coordinates(after) - shapely.get_coordinates(before))
 
 
 def angle_between(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angle between vectors of shape (n, 2), degrees from 0 to 180."""
+    """Return the angle between vectors of shape (n, 2), degrees from 0 to 180."""
     cross = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
     return np.asarray(np.degrees(np.arctan2(np.abs(cross), (one * other).sum(axis=1))))
 

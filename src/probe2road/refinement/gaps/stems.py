@@ -28,14 +28,14 @@ _DETOUR = 1.5  # times the distance; nodes that an edge up to this long joins ne
 
 
 def facing_stems(graph: RoadGraph, options: GapOptions) -> NDArray[np.int64]:
-    """List the pairs of nodes that a straight link across a gap shall join.
+    """List the pairs of nodes that a straight link across a gap should join.
 
     Parameters
     ----------
     graph
         Any road graph.
     options
-        Of which ``max_length``, ``heading_length`` and ``stem_turn`` are used.
+        Only ``max_length``, ``heading_length`` and ``stem_turn`` are used.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def facing_stems(graph: RoadGraph, options: GapOptions) -> NDArray[np.int64]:
 def _stems(
     graph: RoadGraph, reach: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Collect the edge ends that nothing continues: node row, position, direction out of the road, at a junction."""
+    """Collect edge ends that no other edge continues: node row, position, direction out of the road, at a junction."""
     measured = graph.ends(reach=reach)
     node, position, ahead = measured.node, measured.position, -measured.ahead
     ends = pd.DataFrame({"node": node, "end": np.arange(len(node))})
@@ -92,7 +92,7 @@ def _stems(
 
 
 def _joined(graph: RoadGraph, links: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell which links have an edge between their nodes that is hardly longer."""
+    """Tell which links have an edge between the same nodes that is hardly longer than the link."""
     place = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
     ends = np.sort(graph.end_rows, axis=1)
     shortest = graph.edges["length"].groupby([ends[:, 0], ends[:, 1]]).min()
@@ -102,7 +102,7 @@ def _joined(graph: RoadGraph, links: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def _crossing(graph: RoadGraph, links: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell which links cross an edge that ends at neither of their nodes."""
+    """Tell which links cross an edge that does not end at one of their nodes."""
     place = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
     bodies = shapely.linestrings(place[links]) if len(links) else np.zeros(0, object)
     link, edge = shapely.STRtree(graph.edges.geometry.to_numpy()).query(bodies, predicate="intersects")

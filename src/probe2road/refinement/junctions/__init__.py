@@ -1,4 +1,4 @@
-"""Junctions as traces drive them: false ones taken apart, forks where ramps leave, carriageways side by side."""
+"""Junctions corrected by traces: false junctions split, forks moved, roads side by side separated."""
 
 from pkgutil import iter_modules
 

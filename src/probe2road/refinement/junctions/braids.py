@@ -1,4 +1,4 @@
-"""Braids: roads side by side whose lines touch again and again, told apart by the direction in which they are driven.
+"""Braids: parallel roads whose lines touch again and again, separated by the direction of traffic.
 
 Strategy
 --------
@@ -41,39 +41,39 @@ __all__ = ["BraidOptions", "open_braids"]
 logger = logging.getLogger(__name__)
 
 _NEAR, _FAR = 8.0, 30.0  # m from a node between which the direction of an edge is measured
-_SHARE = 0.9  # of a short edge, up to which it is measured
+_SHARE = 0.9  # share of a short edge over which the direction is measured
 _STEP = 5.0  # m between the points of new lines
 _SMOOTH = 25.0  # m over which the middle of a chain is averaged
 _TRIM = 15.0  # m; cut off a road beside a chain, where it has been bent to the first joint
-_MAX_CUT = 0.4  # of an edge
+_MAX_CUT = 0.4  # share of an edge that is cut off at most
 _BESIDE = (15.0, 40.0)  # m from a chain between which the distance of its roads is measured
 
 
 @dataclass(frozen=True)
 @checked
 class BraidOptions:
-    """Which chains of short edges are taken for roads side by side."""
+    """Which chains of short edges count as two parallel roads."""
 
     max_inner: NotNegative[float] = 100.0  # m; longer edges between two joints are roads of their own; 0 opens nothing
     max_shared: NotNegative[float] = 300.0  # m; the same for edges that are driven in both directions
     max_angle: NotNegative[float] = 30.0  # degrees between an edge at a joint and the line of all edges there
     max_width: NotNegative[float] = 16.0  # m between the outermost lines of a chain, and between roads that lead to it
-    min_traces: NotNegative[int] = 3  # that drive in, and out, by the edges that lead to a chain
-    min_share: NotNegative[float] = 0.85  # of the traces on such an edge that drive in its direction
+    min_traces: NotNegative[int] = 3  # fewest traces that drive in, or out, by each outer edge of a chain
+    min_share: NotNegative[float] = 0.85  # least share of the traces on such an edge in one direction
 
 
 @dataclass(frozen=True)
 class _Chain:
-    """A set of joints: rows of nodes, rows of the edges between them, ends that lead away, by side."""
+    """A connected set of joints: rows of nodes, rows of the edges between them, and the outer edge ends by side."""
 
     nodes: NDArray[np.int64]
     inner: NDArray[np.int64]
     ends: NDArray[np.int64]
-    side: NDArray[np.int64]  # 0 or 1, of each end
+    side: NDArray[np.int64]  # 0 or 1, the side of each end
 
 
 def open_braids(graph: RoadGraph, steps: pd.DataFrame, *, options: BraidOptions | None = None) -> RoadGraph:
-    """Replace chains of edges that part and join by the roads that are driven through them.
+    """Replace chains of edges that separate and rejoin by the roads that traces drive through them.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def open_braids(graph: RoadGraph, steps: pd.DataFrame, *, options: BraidOptions 
     steps
         Paths matched on it: `probe2road.matching.match.Matches.steps`.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -140,17 +140,17 @@ def open_braids(graph: RoadGraph, steps: pd.DataFrame, *, options: BraidOptions 
 
 
 def _ways(graph: RoadGraph, steps: pd.DataFrame) -> NDArray[np.int64]:
-    """Count how often each edge is driven forwards and backwards, shape (E, 2)."""
+    """Count the traversals of each edge forwards and backwards, shape (E, 2)."""
     row = step_rows(graph, steps, where="open_braids")
     backwards = ~steps["forward"].to_numpy(bool)
     return np.bincount(2 * row + backwards, minlength=2 * len(graph.edges)).reshape(-1, 2)
 
 
 def _joints(graph: RoadGraph, max_angle: float) -> NDArray[np.bool_]:
-    """Tell which nodes have three edge ends and more that all lie along one line (to so many degrees), shape (N,)."""
+    """Tell which nodes have three or more edge ends, all along one line (within an angle, degrees); shape (N,)."""
     ends, n_nodes = graph.ends(reach=_FAR, skip=_NEAR, share=_SHARE), len(graph.nodes)
     angle = np.arctan2(ends.ahead[:, 1], ends.ahead[:, 0])
-    # Opposite directions are one line: of the doubled angles the mean is taken.
+    # Opposite directions lie on one line, so the mean is that of the doubled angles.
     sums = [np.bincount(ends.node, wave(2.0 * angle), n_nodes) for wave in (np.sin, np.cos)]
     line = np.arctan2(*sums) / 2.0
     aside = np.abs((angle - line[ends.node] + np.pi / 2.0) % np.pi - np.pi / 2.0)
@@ -160,7 +160,7 @@ def _joints(graph: RoadGraph, max_angle: float) -> NDArray[np.bool_]:
 
 
 def _chains(graph: RoadGraph, joint: NDArray[np.bool_], inner: NDArray[np.bool_]) -> Iterator[_Chain]:
-    """Yield the sets of two joints and more that inner edges connect, from which edges lead to two sides."""
+    """Yield the sets of two or more joints that inner edges connect and that have outer edges on two sides."""
     node = graph.end_rows.ravel()
     places = shapely.get_coordinates(graph.nodes.geometry.to_numpy())
     for ends in _ends_by_part(graph, joint, inner):
@@ -172,7 +172,7 @@ def _chains(graph: RoadGraph, joint: NDArray[np.bool_], inner: NDArray[np.bool_]
 
 
 def _ends_by_part(graph: RoadGraph, joint: NDArray[np.bool_], inner: NDArray[np.bool_]) -> Iterator[NDArray[np.int64]]:
-    """Yield the edge ends at each set of two joints and more that inner edges connect."""
+    """Yield the edge ends at each set of two or more joints that inner edges connect."""
     node, n_nodes = graph.end_rows.ravel(), len(graph.nodes)
     links = coo_array((np.ones(inner.sum()), tuple(graph.end_rows[inner].T)), shape=(n_nodes, n_nodes))
     part = connected_components(links, directed=False)[1]
@@ -183,7 +183,7 @@ def _ends_by_part(graph: RoadGraph, joint: NDArray[np.bool_], inner: NDArray[np.
 
 
 def _sides(joints: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Say for each place (m) which of the two joints farthest apart is nearer: 0 or 1."""
+    """Return for each place (m) which of the two joints farthest apart is nearer: 0 or 1."""
     apart = np.hypot(*(joints[:, None] - joints).T)
     first, last = np.unravel_index(apart.argmax(), apart.shape)
     to_first, to_last = (np.hypot(*(places - joints[joint]).T) for joint in (first, last))
@@ -193,7 +193,7 @@ def _sides(joints: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[
 def _roads(
     chain: _Chain, into: NDArray[np.int64], out: NDArray[np.int64], options: BraidOptions
 ) -> list[tuple[int, int]]:
-    """Pair the ends by which traces drive into a chain with those by which they leave it; empty if that is not sure."""
+    """Pair the ends where traces enter a chain with those where they leave it; return an empty list if unclear."""
     least = np.maximum(options.min_traces, options.min_share * (into + out))
     came, went = into >= least, out >= least
     if not (came | went).all():
@@ -213,7 +213,7 @@ def _middle(
     lines: NDArray[np.object_],
     rows: NDArray[np.int64],
 ) -> NDArray[np.float64] | None:
-    """Find points along the middle of a chain (m, 2), in the direction of its first road; None if nothing leads on."""
+    """Return points along the middle of a chain (m, 2), in the direction of its first road; None without a path."""
     node = rows.ravel()
     came, went = roads[0]
     way = _way_through(chain, lines, rows, int(node[came]), int(node[went]))
@@ -222,7 +222,7 @@ def _middle(
     count = max(round(way.length / _STEP), 2) + 1
     points = shapely.get_coordinates(way.interpolate(np.linspace(0.0, 1.0, count), normalized=True))
     normal = _normals(points)
-    # The way goes by one side of a lens: it is moved to the middle between what lies outermost on either side.
+    # The path follows one side of each lens: it is moved to the middle between the outermost points on both sides.
     every = shapely.get_coordinates(shapely.segmentize(lines[chain.inner], _STEP))
     near = cKDTree(points).query(every)[1]
     left = ((every - points[near]) * normal[near]).sum(axis=1)
@@ -236,7 +236,7 @@ def _middle(
 def _way_through(
     chain: _Chain, lines: NDArray[np.object_], rows: NDArray[np.int64], start: int, stop: int
 ) -> shapely.LineString | None:
-    """Find the shortest way from joint to joint along the edges of a chain."""
+    """Find the shortest path from joint to joint along the edges of a chain."""
     at = {int(node): k for k, node in enumerate(chain.nodes)}
     n = len(at)
     length = np.full((n, n), np.inf)
@@ -262,7 +262,7 @@ def _way_through(
 def _offsets(
     roads: list[tuple[int, int]], lines: NDArray[np.object_], middle: NDArray[np.float64], options: BraidOptions
 ) -> NDArray[np.float64] | None:
-    """How far to the left of the middle the first road is, at both ends, m; the second is as far to the right.
+    """Return how far left of the middle the first road is at both ends (m); the second road is as far to the right.
 
     None where the roads are too far apart, or change sides.
     """
@@ -282,38 +282,38 @@ def _offsets(
 
 
 def _normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Point to the left along a line: unit vectors, shape (m, 2)."""
+    """Return the unit vectors that point to the left of a line, shape (m, 2)."""
     ahead = np.gradient(points, axis=0)
     return np.asarray(np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.hypot(*ahead.T)[:, None])
 
 
 def _beside(line: shapely.LineString, end: int) -> NDArray[np.object_]:
-    """Points on a line some way from one of its ends."""
+    """Return points on a line at a distance from one of its ends."""
     far = min(_BESIDE[1], line.length)
     along = np.linspace(min(_BESIDE[0], far), far, 6)
     return np.asarray(shapely.line_interpolate_point(line, along if end == 0 else line.length - along))
 
 
 def _width(lines: NDArray[np.object_], middle: NDArray[np.float64]) -> float:
-    """Twice how far any point of some lines is from their middle, m."""
+    """Return twice the largest distance of a point of some lines from their middle, m."""
     points = shapely.points(shapely.get_coordinates(shapely.segmentize(lines, _STEP)))
     return 2.0 * float(shapely.distance(points, shapely.LineString(middle)).max())
 
 
 class _Changes:
-    """What becomes of a graph, chain by chain."""
+    """The changes to a graph, collected chain by chain."""
 
     def __init__(self, graph: RoadGraph) -> None:
         self.graph = graph
         self.chains: list[_Chain] = []
         self._edges: list[pd.DataFrame] = []
         self._places: list[NDArray[np.float64]] = []  # of new nodes
-        self._target = np.full((len(graph.edges), 2), -1)  # new node of each end, where it has one
+        self._target = np.full((len(graph.edges), 2), -1)  # new node of each end, -1 for none
 
     def add(
         self, chain: _Chain, roads: list[tuple[int, int]], middle: NDArray[np.float64], left: NDArray[np.float64]
     ) -> None:
-        """Put one line a road in the place of a chain."""
+        """Replace a chain by one line for each road."""
         self.chains.append(chain)
         longest = chain.inner[self.graph.edges["length"].to_numpy()[chain.inner].argmax()]
         aside = np.linspace(left[0], left[1], len(middle))[:, None] * _normals(middle)
@@ -327,7 +327,7 @@ class _Changes:
             self._edges.append(row)
 
     def made(self) -> RoadGraph:
-        """Make all changes."""
+        """Apply all changes to the graph."""
         graph, lines = self.graph, self.graph.edges.geometry.to_numpy().copy()
         free = int(graph.nodes.index.max()) + 1
         ids = np.arange(free, free + len(self._places))

@@ -1,4 +1,4 @@
-"""Forks: junctions where two roads part at a flat angle, moved to where their traces part.
+"""Forks: junctions where two roads separate at a flat angle, moved to where their traces separate.
 
 Strategy
 --------
@@ -42,18 +42,18 @@ __all__ = ["ForkOptions", "Forks", "find_forks", "move_forks"]
 logger = logging.getLogger(__name__)
 
 _NEAR, _FAR = 10.0, 40.0  # m from a junction between which the direction of a road is measured
-_SHARE = 0.9  # of a short road, up to which it is measured
+_SHARE = 0.9  # share of a short road over which the direction is measured
 _STRAIGHT = -0.75  # cosine between the common road and the mean of both branches, at most
 _BIN = 5.0  # m along the common road
 _STEP = 2.5  # m between bends that are tried
 _LEVEL = 10.0  # m of the common road that must be seen before the bend
 _FEWEST_BINS = 5
-_ENOUGH = 20  # traces beyond which more make a bin no better
-_KEPT = 10.0  # m that must be left of the common road
+_ENOUGH = 20  # traces; a bin with more has no more weight
+_KEPT = 10.0  # m of the common road that must remain
 _LEAST = 3.0  # m; moving by less is not worth it
 # Of lanes that lead to a fork, all m: where they end, how long they are, and over what length traces change to them.
 _LANE_ENDS, _LANE_LENGTHS, _LANE_CHANGES = np.arange(0.0, 95.0, 2.5), (10.0, 20.0, 30.0, 45.0, 60.0), (25.0, 45.0, 70.0)
-_LANE_GAIN = 0.5  # of the squared errors of one rise, what must be left with two
+_LANE_GAIN = 0.5  # largest ratio of the squared errors with two rises to those with one
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,14 @@ _LANE_GAIN = 0.5  # of the squared errors of one rise, what must be left with tw
 class ForkOptions:
     """Which forks are moved, and how far."""
 
-    reach: NotNegative[float] = 120.0  # m along the common road, farthest that a fork is moved; 0 moves none
+    reach: NotNegative[float] = 120.0  # m along the common road, by which a fork moves at most; 0 moves none
     max_angle: NotNegative[float] = 35.0  # degrees between the two branches of a fork
     min_traces: NotNegative[int] = 3  # traces that each branch needs at a place
-    min_rise: NotNegative[float] = 1.5  # m by which traces must have drawn apart where the fork was
+    min_rise: NotNegative[float] = 1.5  # m by which traces must be apart at the old place of the fork
     confidence: NotNegative[float] = 3.0  # standard errors by which the rise must differ from none
-    min_lane: NotNegative[float] = 2.5  # m, of a lane that traces change to before they part
-    max_lane: NotNegative[float] = 4.5  # m; a rise that is higher is none to another lane
-    rejoin: NotNegative[float] = 12.0  # m behind the old place where the branches are as before
+    min_lane: NotNegative[float] = 2.5  # m, width of a lane that traces change to before they separate
+    max_lane: NotNegative[float] = 4.5  # m; a larger change is not one to a neighbouring lane
+    rejoin: NotNegative[float] = 12.0  # m behind the old place of the fork, from which the branches stay as they were
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Forks:
 
 
 def move_forks(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: ForkOptions | None = None) -> RoadGraph:
-    """Move forks back along the common road to where the traces of the two branches part.
+    """Move forks back along the common road to where the traces of the two branches separate.
 
     Topology, ids and attributes stay; geometry, ``length`` and the places of nodes change. A fork stays where it is if
     a branch has too few traces, if their distance does not grow, or if it grows all along the road that is seen. Where
@@ -96,7 +96,7 @@ def move_forks(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: For
     matches
         From `probe2road.matching.match.match`.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -141,7 +141,7 @@ def move_forks(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: For
 
 
 def find_forks(graph: RoadGraph, *, max_angle: float = ForkOptions.max_angle) -> Forks:
-    """Find the nodes of three edges of which two go on in about the direction of the third.
+    """Find the nodes of three edges where two edges continue in about the direction of the third.
 
     Examples
     --------
@@ -172,7 +172,7 @@ def find_forks(graph: RoadGraph, *, max_angle: float = ForkOptions.max_angle) ->
 def _distances(
     forks: Forks, driven: Traversals, fixes: FramedFixes, length: NDArray[np.float64], options: ForkOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Distance between the traces of both branches along the common road, and traces of the lesser, ``(F, B)``."""
+    """Return the distance between the branches' traces along the common road, and the smaller count, ``(F, B)``."""
     of_end = np.full(2 * len(length), -1)
     of_end[forks.stem] = np.arange(len(forks.stem))
     bins = max(int(options.reach / _BIN), 1)
@@ -196,7 +196,7 @@ def _distances(
 
 
 def _branch_taken(forks: Forks, driven: Traversals, fork: NDArray[np.int64], end: int) -> NDArray[np.int64]:
-    """Which branch each drive along a common road came from or went to at one of its ends: 0, 1, or -1, ``(T,)``."""
+    """Return the branch that each drive takes at one end of its edge: 0, 1, or -1 for neither; ``(T,)``."""
     same = driven.trace[1:] == driven.trace[:-1]
     after, before = np.full(len(driven.edge), -1), np.full(len(driven.edge), -1)
     after[:-1][same], before[1:][same] = driven.edge[1:][same], driven.edge[:-1][same]
@@ -206,7 +206,7 @@ def _branch_taken(forks: Forks, driven: Traversals, fork: NDArray[np.int64], end
 
 
 def _bends(apart: NDArray[np.float64], count: NDArray[np.int64], options: ForkOptions) -> NDArray[np.float64]:
-    """Metres from each fork to where a level and a rise fit its distances best, ``(F,)``; 0 where nothing rises."""
+    """Return how far (m) from each fork its branches begin to separate, by a fit, ``(F,)``; 0 if nowhere."""
     at, weight, value = _weighted(apart, count, options)
     seen = np.where(weight > 0, at, 0.0).max(axis=1)
     free = (weight > 0).sum(axis=1) - 3.0  # level, rise and bend are fitted
@@ -214,11 +214,11 @@ def _bends(apart: NDArray[np.float64], count: NDArray[np.int64], options: ForkOp
     least, bend = np.full(len(apart), np.inf), np.zeros(len(apart))
     for place in _places(options):
         rise = np.maximum(place - at, 0.0)
-        r, rr, ry = weight @ rise, weight @ rise**2, (weight * value) @ rise
-        spread = np.maximum(sums[0] * rr - r**2, 1e-9)
-        slope = (sums[0] * ry - r * sums[1]) / spread
-        level = (sums[1] - slope * r) / np.maximum(sums[0], 1e-9)
-        error = sums[2] - level * sums[1] - slope * ry
+        sum_rise, sum_square, sum_product = weight @ rise, weight @ rise**2, (weight * value) @ rise
+        spread = np.maximum(sums[0] * sum_square - sum_rise**2, 1e-9)
+        slope = (sums[0] * sum_product - sum_rise * sums[1]) / spread
+        level = (sums[1] - slope * sum_rise) / np.maximum(sums[0], 1e-9)
+        error = sums[2] - level * sums[1] - slope * sum_product
         doubt = np.sqrt(np.maximum(error, 1e-9) / np.maximum(free, 1.0) * sums[0] / spread)
         fits = (np.abs(slope * place) >= options.min_rise) & (np.abs(slope) >= options.confidence * doubt)
         better = (error < least) & (place <= seen - _LEVEL) & (free >= _FEWEST_BINS - 3)
@@ -229,14 +229,14 @@ def _bends(apart: NDArray[np.float64], count: NDArray[np.int64], options: ForkOp
 
 @dataclass(frozen=True)
 class _Lane:
-    """A lane of its own that leads to a fork; all m along the common road, away from the fork."""
+    """A separate lane that leads to a fork; all lengths are m along the common road, away from the fork."""
 
-    end: float  # where it ends
+    end: float  # where the lane ends
     length: float
-    change: float  # over which traces change to it, behind its length
+    change: float  # m over which traces change to the lane, behind its length
 
     def rises(self, at: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return what distances of traces are made of at places ``(B,)``: the lane, and the rise behind its end."""
+        """Return the model terms of trace distances at places ``(B,)``: the lane, and the rise behind its end."""
         to_lane = np.clip((self.end + self.length + self.change - at) / self.change, 0.0, 1.0)
         return [to_lane, np.maximum(self.end - at, 0.0)] if self.end else [to_lane]
 
@@ -244,7 +244,7 @@ class _Lane:
 def _lane_ends(
     apart: NDArray[np.float64], count: NDArray[np.int64], bend: NDArray[np.float64], options: ForkOptions
 ) -> NDArray[np.float64]:
-    """Bends (m), ``(F,)``, and where two rises with a lane between them fit the distances much better, its end."""
+    """Return bends (m), ``(F,)``, or the end of a lane where a model with a lane fits the distances much better."""
     bend = bend.copy()
     bent = np.flatnonzero(bend)
     at, weight, value = _weighted(apart[bent], count[bent], options)
@@ -258,7 +258,7 @@ def _lane_ends(
 def _best_lanes(
     at: NDArray[np.float64], weight: NDArray[np.float64], value: NDArray[np.float64], options: ForkOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Find the lane that fits the distances at each fork best: its end (m), and the squared errors, ``(F,)`` each.
+    """Find the lane that fits the distances at each fork best: return its end (m) and the squared error, ``(F,)`` each.
 
     The errors are infinite where none fits that is as wide as a lane.
     """
@@ -273,21 +273,21 @@ def _best_lanes(
 
 
 def _lanes(options: ForkOptions) -> Iterator[_Lane]:
-    """Yield the lanes that are tried: those behind which enough of the common road is left."""
+    """Yield the lanes to try: those that leave enough of the common road behind them."""
     for lane in (_Lane(*sizes) for sizes in product(_LANE_ENDS.tolist(), _LANE_LENGTHS, _LANE_CHANGES)):
         if lane.end + lane.length <= options.reach - 2.0 * _LEVEL:
             yield lane
 
 
 def _places(options: ForkOptions) -> NDArray[np.float64]:
-    """Bends that are tried, m from the fork."""
+    """Return the positions of bends to try, m from the fork."""
     return np.arange(_BIN, options.reach, _STEP)
 
 
 def _weighted(
     apart: NDArray[np.float64], count: NDArray[np.int64], options: ForkOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Middles of the bins (m), ``(B,)``; weights and distances, ``(F, B)``, both 0 where too few traces are."""
+    """Return the bin middles (m), ``(B,)``, and weights and distances, ``(F, B)``: both 0 where traces are too few."""
     known = np.isfinite(apart) & (count >= max(options.min_traces, 1))
     weight = np.where(known, np.minimum(count, _ENOUGH), 0).astype(np.float64)
     at = (np.arange(apart.shape[1], dtype=np.float64) + 0.5) * _BIN
@@ -297,7 +297,7 @@ def _weighted(
 def _fit(
     terms: Sequence[NDArray[np.float64]], weight: NDArray[np.float64], value: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit a level and terms ``(B,)`` to each row of values: factors of the terms, ``(F, terms)``, squared errors."""
+    """Fit a level and terms ``(B,)`` to each row of values: return the factors, ``(F, terms)``, and squared errors."""
     basis = np.vstack([np.ones(value.shape[1]), *terms])
     normal = np.einsum("fb,ib,jb->fij", weight, basis, basis) + 1e-6 * np.eye(len(basis))
     right = (weight * value) @ basis.T
@@ -306,7 +306,7 @@ def _fit(
 
 
 def _room(forks: Forks, shift: NDArray[np.float64], length: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shorten shifts (m) to what the common road has, so that two forks do not pass each other."""
+    """Limit shifts (m) to the length of the common road, so that two forks do not pass each other."""
     stem = forks.stem // 2
     wanted = np.bincount(stem, shift, minlength=len(length))[stem]
     room = np.maximum(length[stem] - _KEPT, 0.0)

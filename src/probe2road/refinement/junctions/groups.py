@@ -1,4 +1,4 @@
-"""Which edge ends at a junction belong together: by what traces drove, how high they were, how straight they lie."""
+"""Which edge ends at a junction belong together: by driven passages, heights, and directions."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ __all__ = [
 ]
 
 _REACH = 20.0  # m; the direction of an edge end is measured over this length
-_SHARE = 0.5  # of a short edge, over which it is measured at most
-_USUAL_SPREAD = 3.0  # m, of heights between traces, where the data is too little to tell
+_SHARE = 0.5  # largest share of a short edge over which the direction is measured
+_USUAL_SPREAD = 3.0  # m, spread of heights between traces if there are too few data
 _LEAST_SPREAD = 0.5  # m
 _FEWEST = 5  # traces of one pair of ends from which a spread is estimated
-_ENOUGH = 30  # heights from which a spread is believed
+_ENOUGH = 30  # heights from which the estimated spread is used
 _MAD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _MEDIAN_LOSS = 1.25  # standard error of a median over that of a mean
 
 
 @dataclass(frozen=True)
 class GroupingRules:
-    """From what on edge ends are connected, and apart: part of `DisambiguateOptions`."""
+    """When edge ends count as connected, and when as apart: part of `DisambiguateOptions`."""
 
     min_count: int
     min_share: float
@@ -44,7 +44,7 @@ class GroupingRules:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What was counted between m places; p pairs of places, of which q traces have heights."""
+    """The counted passages between m places: p pairs of places, with heights from q traces."""
 
     places: Places
     pairs: pd.DataFrame  # p rows: one, other (places, one <= other), count (passages, both directions)
@@ -70,16 +70,16 @@ def evidence(places: Places, passages: Passages) -> Evidence:
 
 
 def connected_ends(found: Evidence, *, min_count: int) -> NDArray[np.int64]:
-    """Give places that pairs with ``min_count`` passages connect one number, shape (m,).
+    """Return the group of every place, shape (m,): pairs with ``min_count`` or more passages share a group.
 
-    The literal reading of the paper: a place without such a pair is a group of its own.
+    This is the literal reading of the paper: a place without such a pair is a group of its own.
     """
     pairs = found.pairs[found.pairs["count"] >= min_count]
     return _components(pairs["one"].to_numpy(), pairs["other"].to_numpy(), len(found.places.end))
 
 
 def proven_groups(graph: RoadGraph, found: Evidence, rules: GroupingRules) -> NDArray[np.int64]:
-    """Return the group of every place, shape (m,): apart only where traces prove it.
+    """Return the group of every place, shape (m,); groups are separated only where traces prove it.
 
     All places of a junction are in one group unless there is proof of two. Numbers of different junctions differ.
     """
@@ -98,7 +98,7 @@ def proven_groups(graph: RoadGraph, found: Evidence, rules: GroupingRules) -> ND
 
 @dataclass(frozen=True)
 class _Labels:
-    """What traces connect, at all junctions; numbers of different junctions differ."""
+    """The connections by traces at all junctions; numbers of different junctions differ."""
 
     proven: NDArray[np.int64]  # (m,) group by joined pairs, -1 for places without one
     unproven: NDArray[np.int64]  # (m,) group of the places without one, by any passage between two such; -1 for others
@@ -119,7 +119,7 @@ class _Junction:
 
 
 def _joined_pairs(found: Evidence, rules: GroupingRules) -> NDArray[np.bool_]:
-    """Tell which pairs of two places enough passages connect, and enough of all at either place, shape (p,)."""
+    """Tell which pairs of places are joined: by enough passages, and by a large enough share at either place; (p,)."""
     one, other, count = (found.pairs[name].to_numpy() for name in ("one", "other", "count"))
     m = len(found.places.end)
     flow = np.bincount(one, count, m) + np.bincount(other, count, m)
@@ -128,7 +128,7 @@ def _joined_pairs(found: Evidence, rules: GroupingRules) -> NDArray[np.bool_]:
 
 
 def _labels(found: Evidence, joined: NDArray[np.bool_]) -> _Labels:
-    """Group places by the pairs that are joined, and those without any by what else was driven."""
+    """Group places by joined pairs, and places without a joined pair by the other passages."""
     one, other = (found.pairs[name].to_numpy() for name in ("one", "other"))
     m = len(found.places.end)
     is_proven = np.zeros(m, bool)
@@ -139,9 +139,9 @@ def _labels(found: Evidence, joined: NDArray[np.bool_]) -> _Labels:
 
 
 def _junctions_in_doubt(found: Evidence, labels: _Labels, head: NDArray[np.int64]) -> NDArray[np.int64]:
-    """List the junctions that may be two, by their first place; ``head``, shape (m,), is that of every place.
+    """List the first place of each junction that may be two; ``head``, shape (m,), gives this place for every place.
 
-    They have two proven groups, or passages between places without proof, which heights might set apart.
+    Such a junction has two proven groups, or passages between unproven places, which heights might separate.
     """
     proven = np.unique(np.stack([head, labels.proven])[:, labels.proven >= 0], axis=1)[0]
     groups = np.bincount(proven, minlength=len(head))
@@ -156,7 +156,7 @@ def _junctions_in_doubt(found: Evidence, labels: _Labels, head: NDArray[np.int64
 def _junction_at(
     places: slice, pairs: NDArray[np.int64], found: Evidence, labels: _Labels, ends: EdgeEnds
 ) -> _Junction:
-    """Collect what is known of one junction, given by its places and the rows of its pairs."""
+    """Collect the evidence at one junction, given its places and the rows of its pairs."""
     end = found.places.end[places]
     table = found.pairs.iloc[pairs]
     local = table[["one", "other"]].to_numpy() - places.start
@@ -199,20 +199,20 @@ def _parted(junction: _Junction, rules: GroupingRules) -> NDArray[np.int64]:
 
 
 def _unproven_groups(junction: _Junction) -> list[NDArray[np.int64]]:
-    """Return the groups of ends without a joined pair that some traces passed between; the most driven first."""
+    """Return the groups of ends that some traces connect but no joined pair; the most driven group first."""
     groups = [group for group in _members(junction.unproven) if len(group) > 1]
     return sorted(groups, key=lambda group: -int(junction.counts[np.ix_(group, group)].sum()))
 
 
 def _members(label: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """List the ends of every group, by its number; ends with number -1 are in none."""
+    """List the ends of every group, in the order of the group numbers; ends numbered -1 are left out."""
     return [np.flatnonzero(label == name) for name in np.unique(label[label >= 0])]
 
 
 def _without_level_crossings(
     junction: _Junction, groups: list[NDArray[np.int64]], rules: GroupingRules
 ) -> list[NDArray[np.int64]]:
-    """Unite groups that cross each other at one level: a crossing where nobody was seen to turn."""
+    """Unite groups that cross each other at one level: this is a crossing where no trace turned."""
     n = len(groups)
     if n < 2:
         return groups
@@ -228,7 +228,7 @@ def _without_level_crossings(
 
 
 def _height_difference(junction: _Junction, one: NDArray[np.int64], other: NDArray[np.int64]) -> tuple[float, float]:
-    """Difference of the median heights of two groups, and its standard error; NaN and infinite without heights."""
+    """Return the difference of the median heights of two groups and its standard error; NaN, infinity if unknown."""
     sides = []
     for group in (one, other):
         within = np.isin(junction.ends, group).all(axis=1)
@@ -260,14 +260,14 @@ def _interleaved(junction: _Junction, one: NDArray[np.int64], other: NDArray[np.
 
 
 def _closest_group(junction: _Junction, end: int, groups: list[NDArray[np.int64]]) -> int:
-    """Return the group that traces connect an end to most often, else the one it continues most nearly straight."""
+    """Return the group that traces connect to an end most often, else the group that the end continues straightest."""
     counts = [int(junction.counts[end, group].sum()) for group in groups]
     straight = [float((junction.direction[group] @ -junction.direction[end]).max()) for group in groups]
     return max(range(len(groups)), key=lambda number: (counts[number], straight[number]))
 
 
 def _components(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """Return the connected component of each of n things that pairs join."""
+    """Return the connected component of each of n items that pairs join."""
     matrix = coo_array((np.ones(len(one), bool), (one, other)), shape=(n, n))
     return connected_components(matrix, directed=False)[1].astype(np.int64) if n else np.zeros(0, np.int64)
 

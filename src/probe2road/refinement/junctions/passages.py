@@ -1,4 +1,4 @@
-"""Passages: what traces did at the junctions of a graph, from edge end to edge end, and where they were then.
+"""Passages: how traces pass the junctions of a graph, from edge end to edge end, and where they were then.
 
 Strategy
 --------
@@ -50,12 +50,12 @@ class Passages:
     step: NDArray[np.int64]  # (n,) row of the steps table, of the step after the junction
 
     def where(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> Passages:
-        """Return some of the passages."""
+        """Return the passages that a mask or rows select."""
         return Passages(*(getattr(self, name)[kept] for name in self.__dataclass_fields__))
 
     @classmethod
     def joined(cls, *parts: Passages) -> Passages:
-        """Put passages one behind the other."""
+        """Concatenate several tables of passages."""
         names = cls.__dataclass_fields__
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
@@ -68,11 +68,11 @@ class Places:
     end: NDArray[np.int64]  # (m,)
 
     def where(self, kept: NDArray[np.bool_]) -> Places:
-        """Return some of the places."""
+        """Return the places that a mask or rows select."""
         return Places(self.junction[kept], self.end[kept])
 
     def find(self, junction: NDArray[np.int64], end: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the row of places that are known to be there."""
+        """Return the rows of places that are known to be in the table."""
         size = int(self.end.max(initial=0)) + 1
         return np.searchsorted(self.junction * size + self.end, junction * size + end)
 
@@ -85,7 +85,7 @@ def places_at_nodes(graph: RoadGraph) -> Places:
 
 
 def places_around(graph: RoadGraph, inner: NDArray[np.int64]) -> Places:
-    """Return the ends around edges taken as junctions with their two nodes, without their own ends."""
+    """Return the edge ends around edges that count as one junction with their nodes; their own ends are left out."""
     at_nodes = places_at_nodes(graph)
     ends = pd.DataFrame({"node": at_nodes.junction, "end": at_nodes.end})
     near = pd.DataFrame({"node": graph.end_rows[inner].T.ravel(), "edge": np.tile(inner, 2)}).merge(ends)
@@ -94,7 +94,7 @@ def places_around(graph: RoadGraph, inner: NDArray[np.int64]) -> Places:
 
 
 def passing_positions(graph: RoadGraph, fleet: Fleet, matches: Matches) -> pd.DataFrame:
-    """Return where every trace was when it passed a node.
+    """Return the position of every trace at the moment it passed a node.
 
     Positions are those of the traces themselves, interpolated between the fixes around the node. One trace is
     metres off, most of all in height, and by nearly the same all along its drive: positions at one junction are to be
@@ -154,7 +154,7 @@ def passing_positions(graph: RoadGraph, fleet: Fleet, matches: Matches) -> pd.Da
 
 
 def node_passages(graph: RoadGraph, steps: pd.DataFrame, positions: pd.DataFrame | None = None) -> Passages:
-    """Return the passages over single nodes: one for each step that was entered over a node.
+    """Return the passages over single nodes: one for each step that enters its edge over a node.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def node_passages(graph: RoadGraph, steps: pd.DataFrame, positions: pd.DataFrame
 def double_passages(
     graph: RoadGraph, single: Passages, inner: NDArray[np.int64]
 ) -> tuple[Passages, NDArray[np.float64]]:
-    """Return the passages over edges taken as junctions, together with their two nodes.
+    """Return the passages over edges that count as one junction together with their two nodes.
 
     Parameters
     ----------
@@ -228,25 +228,25 @@ def double_passages(
 def _interpolated(
     fleet: Fleet, trace_id: pd.Series, moment: NDArray[np.datetime64], place: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Interpolate traces at places that they passed about some moments; NaN where no fixes are near; shape (n, 3)."""
+    """Interpolate traces at given moments, nearest to given places; NaN where no fixes are near; shape (n, 3)."""
     trace = fleet.ids.get_indexer(trace_id)
     clock = fleet.traces["t"].to_numpy("datetime64[ns]")
     fixes = pd.DataFrame({"trace": fleet.owner, "t": clock}).assign(row=np.arange(len(clock)))
     wanted = pd.DataFrame({"trace": trace, "t": moment}).assign(order=np.arange(len(trace))).sort_values("t")
-    # The clock of a trace without one is NaT throughout: such fixes can bracket nothing.
+    # A trace without a clock has NaT as every time: its fixes are neither before nor after a moment.
     fixes = fixes[~np.isnat(clock)].sort_values("t", kind="stable")
     row_before = pd.merge_asof(wanted, fixes, on="t", by="trace").set_index("order")["row"]
     row_after = pd.merge_asof(wanted, fixes, on="t", by="trace", direction="forward").set_index("order")["row"]
-    a, b = (rows.sort_index().to_numpy(np.float64) for rows in (row_before, row_after))
-    known = np.isfinite(a) & np.isfinite(b)
+    row_before, row_after = (rows.sort_index().to_numpy(np.float64) for rows in (row_before, row_after))
+    known = np.isfinite(row_before) & np.isfinite(row_after)
     result = np.full((len(moment), 3), np.nan)
-    i, j = a[known].astype(np.int64), b[known].astype(np.int64)
+    before, after = row_before[known].astype(np.int64), row_after[known].astype(np.int64)
     xyz = fleet.traces[["x", "y", "z"]].to_numpy(np.float64)
-    # Between the two fixes around the moment, where the trace is nearest to the node.
-    ahead, to_node = xyz[j, :2] - xyz[i, :2], place[known] - xyz[i, :2]
+    # The position is that of the nearest place to the node, between the two fixes around the moment.
+    ahead, to_node = xyz[after, :2] - xyz[before, :2], place[known] - xyz[before, :2]
     square = (ahead**2).sum(axis=1)
-    share = np.divide((ahead * to_node).sum(axis=1), square, out=np.zeros(len(i)), where=square > 0).clip(0.0, 1.0)
-    near = np.hypot(*(xyz[j, :2] - xyz[i, :2]).T) <= _FAR
-    near &= np.hypot(*(xyz[i, :2] - place[known]).T) <= _FAR
-    result[known] = np.where(near[:, None], xyz[i] + share[:, None] * (xyz[j] - xyz[i]), np.nan)
+    share = np.divide((ahead * to_node).sum(axis=1), square, out=np.zeros(len(before)), where=square > 0).clip(0.0, 1.0)
+    near = np.hypot(*ahead.T) <= _FAR
+    near &= np.hypot(*to_node.T) <= _FAR
+    result[known] = np.where(near[:, None], xyz[before] + share[:, None] * (xyz[after] - xyz[before]), np.nan)
     return result

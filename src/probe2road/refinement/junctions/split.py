@@ -1,4 +1,4 @@
-"""False junctions: nodes taken apart where traces show that roads only cross in plan.
+"""False junctions: nodes split where traces show that the roads only cross in plan.
 
 Strategy
 --------
@@ -47,17 +47,17 @@ logger = logging.getLogger(__name__)
 
 VARIANTS = ("guarded", "literal")
 
-_SURE = 1.5  # times the usual confidence, where height alone tells an artefact from a real road
+_SURE = 1.5  # factor on the confidence where only height tells an artefact from a real road
 
 
 @dataclass(frozen=True)
 @checked
 class DisambiguateOptions:
-    """When edges that meet at a junction are taken for unconnected."""
+    """When edges that meet at a junction count as unconnected."""
 
     variant: Annotated[str, OneOf(*VARIANTS)] = "guarded"
     min_count: NotNegative[int] = 4  # passages from which two edge ends are connected (METHOD 0.1 row 23)
-    min_share: NotNegative[float] = 0.05  # of the less driven end's passages that a pair must have; fewer are errors
+    min_share: NotNegative[float] = 0.05  # least share in the passages of the less driven end; less is an error
     max_inner: NotNegative[float] = 60.0  # m; shorter edges between junctions may be artefacts; 0 trusts all
     min_apart: NotNegative[float] = 3.0  # m between traces at both nodes of an artefact; on one road they coincide
     min_height: NotNegative[float] = 4.0  # m between traces on stacked roads
@@ -72,7 +72,7 @@ def split_false_junctions(
     positions: pd.DataFrame | None = None,
     options: DisambiguateOptions | None = None,
 ) -> RoadGraph:
-    """Take junctions apart where no traces connect the edges that meet there.
+    """Split junctions where no traces connect the edges that meet there.
 
     The literal variant is the paper's: edge ends with ``min_count`` passages between them, in both directions together,
     are connected, directly or by way of others, and every node is split into its groups of connected ends. An end that
@@ -97,7 +97,7 @@ def split_false_junctions(
     positions
         Result of `probe2road.refinement.junctions.passages.passing_positions`; only the guarded variant uses them.
     options
-        The defaults where it is None.
+        None takes the defaults.
 
     Returns
     -------
@@ -145,7 +145,7 @@ def split_false_junctions(
 
 
 def _guarded(graph: RoadGraph, single: Passages, options: DisambiguateOptions) -> tuple[Passages, RoadGraph, int]:
-    """Split with every guard; return the passages that count, the graph, and how many artefacts were removed."""
+    """Split with every guard; return the passages that count, the graph, and the number of removed artefacts."""
     rules = GroupingRules(options.min_count, options.min_share, options.min_height, options.confidence)
     at_nodes = places_at_nodes(graph)
     group = proven_groups(graph, evidence(at_nodes, single), rules)
@@ -157,7 +157,7 @@ def _guarded(graph: RoadGraph, single: Passages, options: DisambiguateOptions) -
     outer_group = proven_groups(graph, found, rules)
     removed = _artefacts(graph, around, outer_group, double, at_ends, found.spread, options)
 
-    # What is one artefact is not also split node by node.
+    # Nodes of a removed artefact are not split one by one as well.
     ends = graph.edges[["u", "v"]].to_numpy()[removed].ravel()
     taken = np.isin(graph.nodes.index, ends)
     group = np.where(taken[at_nodes.junction], at_nodes.junction + len(group), group)
@@ -172,7 +172,7 @@ def _guarded(graph: RoadGraph, single: Passages, options: DisambiguateOptions) -
 
 
 def _possible_artefacts(graph: RoadGraph, max_length: float) -> NDArray[np.int64]:
-    """Rows of the edges between two junctions up to a length."""
+    """Return the rows of the edges between two junctions up to a length (m)."""
     degree = graph.degrees()
     between = (degree[graph.edges["u"]].to_numpy() >= 3) & (degree[graph.edges["v"]].to_numpy() >= 3)
     short = (graph.edges["length"] <= max_length) & (graph.edges["u"] != graph.edges["v"])
@@ -188,7 +188,7 @@ def _artefacts(
     spread: float,
     options: DisambiguateOptions,
 ) -> NDArray[np.int64]:
-    """Rows of edges that traces of two groups of ends pass over, apart; of two that share a node, the shorter."""
+    """Return the edges that separate groups of ends pass over; of two with a common node, only the shorter."""
     over = slice(0, len(at_ends))
     came, went = (group[around.find(double.junction[over], ends[over])] for ends in (double.came, double.went))
     table = pd.DataFrame(at_ends.reshape(-1, 4)).assign(
@@ -196,7 +196,7 @@ def _artefacts(
     )
     of_group = table[came == went].groupby(["row", "group"])
     traces = of_group["z"].count()
-    # One trace may be metres off, all along.
+    # The heights of a single trace may all be wrong by metres.
     middle = of_group.median().assign(error=(spread / np.sqrt(traces)).where(traces > 1, np.inf))
     found = [row for row, groups in middle.groupby(level="row") if _are_apart(groups, options)]
     u, v = graph.edges[["u", "v"]].to_numpy().T
@@ -213,7 +213,7 @@ def _artefacts(
 
 
 def _are_apart(groups: pd.DataFrame, options: DisambiguateOptions) -> bool:
-    """Tell whether two groups or more are apart, each from every other, in plan at both nodes or else in height.
+    """Tell whether all groups are apart from each other, either in plan at both nodes or in height.
 
     The columns are x, y, x, y at the nodes, then z and its standard error, m; heights may be unknown.
     """

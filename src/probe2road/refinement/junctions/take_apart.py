@@ -1,4 +1,4 @@
-"""Nodes and short edges taken apart by the edge ends that meet there."""
+"""Nodes and short edges split by groups of the edge ends that meet there."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ __all__ = ["open_artefacts", "split_nodes"]
 _TRIM = (5.0, 20.0)  # m; least and most that is cut off a road beside an artefact, where thinning has bent it
 
 
-_MAX_CUT = 0.4  # of an edge
+_MAX_CUT = 0.4  # share of an edge that is cut off at most
 
 
 def split_nodes(graph: RoadGraph, places: Places, group: NDArray[np.int64]) -> RoadGraph:
-    """Take nodes apart by the groups of the edge ends that meet there.
+    """Split nodes into one node for each group of edge ends.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def split_nodes(graph: RoadGraph, places: Places, group: NDArray[np.int64]) -> R
 def open_artefacts(
     graph: RoadGraph, inner: NDArray[np.int64], end: NDArray[np.int64], group: NDArray[np.int64]
 ) -> RoadGraph:
-    """Remove edges together with their nodes, and lead each group of the ends around them to a node of its own.
+    """Remove edges together with their nodes, and give each group of edge ends around them a node of its own.
 
     What thinning has bent towards the removed edge is cut off: half its length, but 5 m to 20 m. A group of two ends is
     one road, which is led straight across.

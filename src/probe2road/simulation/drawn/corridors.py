@@ -1,4 +1,4 @@
-"""Drawings of highway corridors: a motorway of random curvature and what runs and crosses beside it."""
+"""Drawings of highway corridors: a motorway of random curvature, and the roads beside and across it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def draw_corridor(rng: np.random.Generator, length: float) -> list[Road]:
 
 
 def _side(rng: np.random.Generator, path: Path, lanes: int, kind: str) -> list[Road]:
-    """Draw one carriageway and the one-way road beside it, with a ramp at every place either out or in."""
+    """Draw one carriageway and the one-way road beside it, with an entry or exit ramp at every possible place."""
     if kind == "none":
         return carriageway(path, lanes=lanes)[0]
     total = path_length(path)
@@ -54,7 +54,7 @@ def _side(rng: np.random.Generator, path: Path, lanes: int, kind: str) -> list[R
 
 
 def _across(rng: np.random.Generator, axis: Path) -> list[Road]:
-    """Draw overpasses at random angles, far enough apart for their approaches."""
+    """Draw overpasses at random angles, with enough distance between them for their approaches."""
     total = path_length(axis)
     places = np.arange(rng.uniform(300, 700), total - 300.0, rng.uniform(900, 1400))
     roads = []
@@ -69,7 +69,7 @@ def _across(rng: np.random.Generator, axis: Path) -> list[Road]:
 
 
 def _apart(roads: list[Road]) -> list[Road]:
-    """Leave out overpasses that would meet one that is kept."""
+    """Leave out overpasses that would meet an overpass drawn before."""
     kept: list[Road] = []
     for road in roads:
         ends = [other.line[[0, -1]] for other in kept]

@@ -38,7 +38,7 @@ class Pose:
 
     @property
     def xy(self) -> Path:
-        """Position, shape ``(2,)``."""
+        """Return the position, shape ``(2,)``."""
         return np.array([self.x, self.y])
 
 
@@ -48,7 +48,7 @@ def polyline(*points: tuple[float, float]) -> Path:
 
 
 def resample(path: Path, step: float = _STEP) -> Path:
-    """Return points at equal distances of at most ``step`` (m) along a path, its ends included.
+    """Return points at equal distances of at most ``step`` (m) along a path, including its ends.
 
     Examples
     --------
@@ -86,7 +86,7 @@ def offset_path(path: Path, right: ArrayLike) -> Path:
 
 
 def hermite(start: Pose, end: Pose, *, stretch: float = 1.0) -> Path:
-    """Return the cubic curve between two poses; ``stretch`` 1 comes near a circular arc where one fits.
+    """Return the cubic curve between two poses; with ``stretch`` 1 it is close to a circular arc, if one fits.
 
     Examples
     --------
@@ -108,7 +108,7 @@ def hermite(start: Pose, end: Pose, *, stretch: float = 1.0) -> Path:
 
 
 def dubins(start: Pose, end: Pose, *, radius: float, word: str) -> Path:
-    """Return an arc, a straight line and an arc between two poses.
+    """Return a path of an arc, a straight line and an arc between two poses.
 
     Parameters
     ----------

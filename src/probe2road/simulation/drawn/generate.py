@@ -38,7 +38,7 @@ def generate_interchange(
     crs: str = _CRS,
     heights: ProfileOptions | None = None,
 ) -> RoadNetwork:
-    """Draw an interchange of random sizes around the origin.
+    """Draw an interchange with random dimensions around the origin.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def generate_town(
     crs: str = _CRS,
     heights: ProfileOptions | None = None,
 ) -> RoadNetwork:
-    """Draw the streets of a town, at one level: a grid, or the grown pattern of an old town.
+    """Draw the streets of a town at one level: a grid, or the irregular pattern of an old town.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def _finish(
     crs: str,
     heights: ProfileOptions | None,
 ) -> RoadNetwork:
-    """Make the network and say so."""
+    """Build the network and log its size."""
     if driving_side not in DRIVING_SIDES:
         raise OptionError(f"driving side {driving_side!r} is unknown", where="generate", fix="use right or left")
     network = finish(roads, rng=rng, driving_side=driving_side, country=country, crs=crs, heights=heights)

@@ -34,7 +34,7 @@ _LINK = CLASS_DEFAULTS["motorway_link"].lane_width
 
 
 def divided(axis: Path, *, gap: float) -> tuple[Path, Path]:
-    """Return the two carriageways of a road along an axis, its right one first, each in driving direction.
+    """Return the two carriageways of a road along an axis, the right one first, each in driving direction.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def divided(axis: Path, *, gap: float) -> tuple[Path, Path]:
 
 
 def _turned(path: Path, quarter: int) -> Path:
-    """Turn a path about the origin by quarters of a circle, counterclockwise."""
+    """Rotate a path about the origin by quarters of a circle, counterclockwise."""
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter % 4]
     return np.asarray(path @ np.array([[c, s], [-s, c]], dtype=float))
 
@@ -74,7 +74,7 @@ def _diamond(rng: np.random.Generator) -> list[Road]:
 
 
 def _raised(road: Road) -> Road:
-    """Lift levels by one, so that a road at -1 that passes below becomes the ground, and the rest bridges over it."""
+    """Raise all levels by one, so that a road at level -1 becomes the ground and the other roads bridge over it."""
     return Road(
         road.line, road.highway, road.forward, road.backward, road.speed, road.level + 1, road.bridge, road.tunnel
     )
@@ -145,7 +145,7 @@ def _stack(rng: np.random.Generator) -> list[Road]:
 
 
 def _joined(path: Path) -> Path:
-    """Drop points that repeat, and resample."""
+    """Drop repeated points of a path, and resample it."""
     step = np.hypot(*np.diff(path, axis=0).T)
     return resample(path[np.concatenate([[True], step > 1e-6])])
 

@@ -1,4 +1,4 @@
-"""From curves to a network: carriageways with auxiliary lanes, ramps that leave from the outer lane, and structures.
+"""From curves to a network: carriageways with auxiliary lanes, ramps from the outer lane, and structures.
 
 Strategy
 --------
@@ -38,7 +38,7 @@ _ABUTMENT = 10.0  # m, from the border of the lower road to the end of the bridg
 
 @dataclass(frozen=True)
 class Road:
-    """One section to be, with its level: the order at crossings."""
+    """A future section of the network, with its level: the order at crossings."""
 
     line: Path
     highway: str
@@ -52,18 +52,18 @@ class Road:
 
     @property
     def width(self) -> float:
-        """Width of the carriageway, metres."""
+        """Return the width of the carriageway, metres."""
         return (self.forward + self.backward) * CLASS_DEFAULTS[self.highway].lane_width
 
     @property
     def speed_limit(self) -> float:
-        """Speed limit, m/s."""
+        """Return the speed limit, m/s."""
         return self.speed if self.speed is not None else CLASS_DEFAULTS[self.highway].speed_limit
 
 
 @dataclass(frozen=True)
 class Gore:
-    """Where a ramp leaves or joins a carriageway."""
+    """The place where a ramp leaves or joins a carriageway."""
 
     lane: Pose  # in the middle of the outermost lane
     inward: float  # m, from there to the left, to the node
@@ -139,7 +139,7 @@ def ramp(
     speed: float | None = None,
     level: int = 0,
 ) -> Road:
-    """Return the ramp whose lanes follow a path from gore to gore; without a gore the path itself ends in a node."""
+    """Return the ramp whose lanes follow a path from gore to gore; without a gore, the path itself ends in a node."""
     road = Road(path, highway, lanes, speed=speed, level=level)
     s = np.linspace(0.0, path_length(path), len(path))
     taper = taper_length(road.speed_limit, s[-1])
@@ -151,7 +151,7 @@ def ramp(
 
 
 def split_at(road: Road, distances: Sequence[float]) -> list[Road]:
-    """Cut a road where others join it (distances along it in m, its ends left out)."""
+    """Cut a road at distances along it (m) where others join it; its ends are ignored."""
     cuts = [0.0, *sorted(distances), path_length(road.line)]
     return [replace(road, line=_between(road.line, begin, end)) for begin, end in pairwise(cuts)]
 
@@ -165,7 +165,7 @@ def finish(
     crs: str,
     heights: ProfileOptions | None = None,
 ) -> RoadNetwork:
-    """Cut bridges and tunnels, mirror for left-hand traffic, build the network and solve its heights."""
+    """Cut bridges and tunnels, mirror the roads for left-hand traffic, build the network, and compute its heights."""
     pieces = _structures(list(roads))
     mirror = np.array([1.0, -1.0]) if driving_side == "left" else np.array([1.0, 1.0])
     lines = [shapely.LineString(_thin(road.line) * mirror) for road in pieces]
@@ -212,7 +212,7 @@ def _structures(roads: list[Road]) -> list[Road]:
 def _span(
     line: shapely.LineString, other: shapely.LineString, road: Road, below: Road, place: shapely.Point
 ) -> tuple[float, float]:
-    """Return from where to where along a road its structure must reach to span another at a crossing."""
+    """Return where the structure of a road must begin and end to pass over or under another road at a crossing."""
     s, t = line.project(place), other.project(place)
     directions = []
     for curve, at in ((line, s), (other, t)):
@@ -225,7 +225,7 @@ def _span(
 
 
 def _cut_structure(road: Road, line: shapely.LineString, spans: list[tuple[float, float]]) -> list[Road]:
-    """Cut a road into open pieces and structures; spans nearer than 40 m to each other or to an end become one."""
+    """Cut a road into open pieces and structures; those nearer than 40 m to each other, or to an end, are joined."""
     total, merged = line.length, list[list[float]]()
     for begin, end in sorted(spans):
         if merged and begin < merged[-1][1] + 40.0:
@@ -252,7 +252,7 @@ def _cut_structure(road: Road, line: shapely.LineString, spans: list[tuple[float
 
 
 def _snapped(distances: Sequence[float]) -> dict[float, float]:
-    """Map distances to themselves, those within a metre of the one before to that one."""
+    """Map each distance to itself, or to the one before it if that is within a metre."""
     snapped: dict[float, float] = {}
     last = -np.inf
     for s in sorted(distances):
@@ -266,7 +266,7 @@ def _between(path: Path, begin: float, end: float) -> Path:
 
 
 def _offset_between(path: Path, right: NDArray[np.float64], ends: tuple[Pose, Pose]) -> Path:
-    """Offset a path, its ends by the given headings, so that what meets there has the same end."""
+    """Offset a path, but its ends along the normals of given poses, so that paths that meet there have the same end."""
     line = offset_path(path, right)
     for k, pose in ((0, ends[0]), (-1, ends[1])):
         normal = np.array([np.sin(pose.heading), -np.cos(pose.heading)])
@@ -275,5 +275,5 @@ def _offset_between(path: Path, right: NDArray[np.float64], ends: tuple[Pose, Po
 
 
 def _thin(line: Path) -> Path:
-    """Drop vertices that a straight line replaces to within 3 cm."""
+    """Drop vertices that a straight line approximates to within 3 cm."""
     return shapely.get_coordinates(shapely.simplify(shapely.LineString(line), 0.03))

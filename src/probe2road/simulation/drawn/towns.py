@@ -17,7 +17,7 @@ _BLOCK = 110.0  # m
 
 
 def draw_town(rng: np.random.Generator, regular: bool, blocks: int) -> list[Road]:
-    """Draw a town of ``blocks`` by ``blocks``; some streets are missing, but every street can be reached."""
+    """Draw a town of ``blocks`` by ``blocks``; some streets are missing, but all streets are connected."""
     nodes, streets, rank = _grid(rng, blocks) if regular else _grown(rng, blocks)
     keep = _thinned(rng, nodes, streets, rank)
     roads = []
@@ -33,7 +33,7 @@ def draw_town(rng: np.random.Generator, regular: bool, blocks: int) -> list[Road
 
 
 def _grid(rng: np.random.Generator, blocks: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Nodes, streets (pairs of node rows) and whether each is a main street, of a grid with unequal blocks."""
+    """Return the nodes, the streets (pairs of node rows), and which are main streets, of a grid with unequal blocks."""
     side = blocks + 1
     xs, ys = (np.cumsum(rng.uniform(0.7, 1.4, side)) * _BLOCK for _ in range(2))
     xs, ys = xs - xs.mean(), ys - ys.mean()
@@ -50,7 +50,7 @@ def _grid(rng: np.random.Generator, blocks: int) -> tuple[NDArray[np.float64], N
 
 
 def _grown(rng: np.random.Generator, blocks: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Nodes, streets and main streets of a Voronoi diagram of scattered centres; short edges are collapsed."""
+    """Return nodes, streets and main streets from a Voronoi diagram of random centres; short edges are collapsed."""
     side = blocks + 4
     k = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
     centres = (k - (side - 1) / 2 + rng.uniform(-0.38, 0.38, k.shape)) * _BLOCK

@@ -32,7 +32,7 @@ _PREFERENCE = 0.35  # cost of each lane away from the preferred one, over 1 km
 
 @dataclass(frozen=True)
 class LinkLanes:
-    """Lanes of every link as its drivers see them: left to right, offsets positive to the right of travel.
+    """The lanes of every link in the view of a driver: left to right, with offsets positive to the right of travel.
 
     ``shape[j]`` holds offset, start_offset, end_offset, start_taper, end_taper (m) of lane j; link i owns the lanes
     ``indptr[i]:indptr[i + 1]``.
@@ -44,7 +44,7 @@ class LinkLanes:
 
 
 def link_lanes(network: RoadNetwork, graph: LinkGraph) -> LinkLanes:
-    """Arrange the lanes of a network by link.
+    """Sort the lanes of a network by link.
 
     Examples
     --------
@@ -79,7 +79,7 @@ def choose_lanes(
     lanes: LinkLanes,
     preferred: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Choose the lane in which each link of a route is entered and left.
+    """Choose the lanes in which a vehicle enters and leaves each link of a route.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def _viterbi(
 def _step(
     shape: NDArray[np.float64], before: int, a: int, others: int, first: int, b: int, count: int, turn: float
 ) -> float:
-    """Cost of passing from lane a at the end of one link to lane b at the start of the next."""
+    """Return the cost of going from lane a at the end of one link to lane b at the start of the next."""
     if abs(turn) < _CORNER:
         apart = abs(shape[before + a, 2] - shape[first + b, 1]) / _MISMATCH
         return apart * apart

@@ -1,4 +1,4 @@
-"""The line that a vehicle drives: lane by lane along its route, smooth in plan at every join.
+"""The path that a vehicle drives: lane by lane along its route, smooth in plan at every join.
 
 Strategy
 --------
@@ -40,7 +40,7 @@ _MIN_FADE = 10.0  # m
 
 
 class SectionShapes(NamedTuple):
-    """Vertices of all section lines, flat, with what is needed to walk along them.
+    """The vertices of all section lines as flat arrays, with the data needed to walk along them.
 
     A named tuple, which compiled code takes whole.
     """
@@ -52,7 +52,7 @@ class SectionShapes(NamedTuple):
 
     @property
     def lengths(self) -> NDArray[np.float64]:
-        """Length of every section in plan, m."""
+        """Return the length of every section in plan, m."""
         return self.along[self.indptr[1:] - 1]
 
 
@@ -151,7 +151,7 @@ def driven_path(
 def _sample_links(
     drive: _Drive, links: _Links, shapes: SectionShapes
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Sample every link at its lane: points ``(k, 3)``, unit driving directions ``(k, 2)``, metres along the link."""
+    """Sample every link along its lane: points ``(k, 3)``, unit directions ``(k, 2)``, metres along the link."""
     route, entered, left, change, indptr = drive
     points = np.zeros((indptr[-1], 3))
     tangent = np.zeros((indptr[-1], 2))
@@ -191,7 +191,7 @@ def _place(
     point: NDArray[np.float64],
     tangent: NDArray[np.float64],
 ) -> None:
-    """Write the point of a section line behind a vertex, and its unit driving direction."""
+    """Write a point of a section line after a given vertex, and its unit driving direction."""
     run = shapes.along[vertex + 1] - shapes.along[vertex]
     share = (at - shapes.along[vertex]) / run if run > 0 else 0.0
     for axis in range(3):
@@ -204,7 +204,7 @@ def _place(
 
 @njit(cache=True)
 def _lane_offset(shape: NDArray[np.float64], s: float, length: float) -> float:
-    """Evaluate one lane's lateral offset, as `probe2road.simulation.lanes.lanes.lateral_offset` does."""
+    """Return the lateral offset of one lane, as `probe2road.simulation.lanes.lanes.lateral_offset` does."""
     start = 1.0 - _smooth_step(s / max(shape[3], 1e-9))
     end = 1.0 - _smooth_step((length - s) / max(shape[4], 1e-9))
     return shape[0] + (shape[1] - shape[0]) * start + (shape[2] - shape[0]) * end
@@ -212,7 +212,7 @@ def _lane_offset(shape: NDArray[np.float64], s: float, length: float) -> float:
 
 @njit(cache=True)
 def _smooth_step(t: float) -> float:
-    """Pass from 0 at 0 to 1 at 1 without a kink."""
+    """Return a smooth step from 0 at 0 to 1 at 1."""
     t = min(max(t, 0.0), 1.0)
     return t * t * (3.0 - 2.0 * t)
 
@@ -221,7 +221,7 @@ def _smooth_step(t: float) -> float:
 def _join_links(
     points: NDArray[np.float64], tangent: NDArray[np.float64], along: NDArray[np.float64], indptr: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Close gaps and round corners: the joined line ``(k, 3)`` and the link that each vertex belongs to."""
+    """Close gaps and round corners: return the joined line ``(k, 3)`` and the link of each vertex."""
     m = len(indptr) - 1
     moved = points.copy()
     cut_start, cut_end = np.zeros(m), np.zeros(m)
@@ -252,7 +252,7 @@ def _corner_cuts(
     turn: float,
     cross: float,
 ) -> tuple[float, float]:
-    """Metres to cut off before and behind a corner, so that an arc touches both lanes.
+    """Return the lengths (m) to cut off before and after a corner, so that an arc touches both lanes.
 
     The arc's tangents meet where the two lanes would cross, which lies before the node for a turn towards the kerb
     and behind it for a turn across.
@@ -269,7 +269,7 @@ def _corner_cuts(
 def _shift_tail(
     points: NDArray[np.float64], along: NDArray[np.float64], i0: int, i1: int, shift: NDArray[np.float64], fade: float
 ) -> None:
-    """Move the last stretch of a link, most at its end."""
+    """Move the last stretch of a link sideways, most at its end."""
     for row in range(i0, i1):
         weight = _smooth_step(1.0 - (along[i1 - 1] - along[row]) / max(fade, 1e-6))
         for axis in range(2):
@@ -280,7 +280,7 @@ def _shift_tail(
 def _shift_head(
     points: NDArray[np.float64], along: NDArray[np.float64], i0: int, i1: int, shift: NDArray[np.float64], fade: float
 ) -> None:
-    """Move the first stretch of a link, most at its start."""
+    """Move the first stretch of a link sideways, most at its start."""
     for row in range(i0, i1):
         weight = _smooth_step(1.0 - along[row] / max(fade, 1e-6))
         for axis in range(2):
@@ -297,7 +297,7 @@ def _assemble(
     cut_start: NDArray[np.float64],
     cut_end: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Put the links one behind the other, with a Bezier arc at every corner."""
+    """Concatenate the links, with a Bezier arc at every corner."""
     m = len(indptr) - 1
     arc = 13  # vertices of an arc
     out = np.zeros((indptr[-1] + arc * m, 3))
@@ -332,7 +332,7 @@ def _bezier(
     t: float,
     out: NDArray[np.float64],
 ) -> None:
-    """Evaluate the cubic that leaves a and reaches b along their tangents; for equal cuts it is nearly a circle."""
+    """Return points of the cubic between a and b along their tangents; with equal cuts it is nearly a circular arc."""
     chord = np.hypot(b[0] - a[0], b[1] - a[1])
     cosine = min(max(a_tangent[0] * b_tangent[0] + a_tangent[1] * b_tangent[1], -1.0), 1.0)
     half = max(np.arccos(cosine) / 2.0, 1e-3)
@@ -350,7 +350,7 @@ def _resampled(
     left: NDArray[np.int64],
     change: NDArray[np.float64],
 ) -> DrivenPath:
-    """Resample the joined line every metre, smooth it, and say which link and lane each sample is in."""
+    """Resample the joined line at every metre and smooth it; return the link and the lane of each sample, too."""
     step = np.hypot(np.diff(xyz[:, 0]), np.diff(xyz[:, 1]))
     kept = np.concatenate([[True], step > 1e-3])
     xyz, position = xyz[kept], position[kept]
@@ -369,7 +369,7 @@ def _resampled(
 
 
 def _smoothed(line: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Smooth a line sampled every metre; more where it bends too tightly, as at a right angle inside a section."""
+    """Smooth a line sampled at every metre, more strongly where it bends too tightly for a vehicle."""
     smooth = _gaussian(line, _SMOOTHING)
     heading = np.unwrap(np.arctan2(np.gradient(smooth[:, 0]), np.gradient(smooth[:, 1])))
     bend = np.abs(np.gradient(heading)) / PATH_SPACING
@@ -382,7 +382,7 @@ def _smoothed(line: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _gaussian(line: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
-    """Filter a line, mirrored through its end points, so that the ends stay and keep their direction."""
+    """Smooth a line that is mirrored at its end points, so that the ends keep their position and direction."""
     pad = min(int(4 * sigma / PATH_SPACING), len(line) - 1)
     head, tail = 2 * line[0] - line[pad:0:-1], 2 * line[-1] - line[-2 : -2 - pad : -1]
     padded = np.concatenate([head, line, tail])

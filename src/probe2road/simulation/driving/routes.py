@@ -30,7 +30,7 @@ _ATTEMPTS = 50  # origins tried before giving up: an origin may reach no destina
 @dataclass(frozen=True)
 @checked
 class DemandModel:
-    """How many drives begin and end where, and how drivers choose their way.
+    """How often drives start and end on each road, and how drivers choose their route.
 
     A drive begins at a link drawn by weight: Zipf's law over randomly ranked links times the traffic that a class
     carries. Its end is drawn from the links that it can reach, by their weight and by how long the way is (a
@@ -56,7 +56,7 @@ class DemandModel:
 
 @dataclass(frozen=True)
 class LinkGraph:
-    """n links and the m movements between them, in flat arrays that travel to worker processes."""
+    """n links and the m movements between them, as flat arrays that can be sent to worker processes."""
 
     section: NDArray[np.int64]  # (n,) row of the link's section in network.sections
     direction: NDArray[np.int64]  # (n,) +1 drives from u to v, -1 from v to u
@@ -72,7 +72,7 @@ class LinkGraph:
 
     @property
     def n(self) -> int:
-        """Number of links."""
+        """Return the number of links."""
         return len(self.section)
 
 
@@ -130,7 +130,7 @@ def link_graph(network: RoadNetwork, demand: DemandModel, *, rng: np.random.Gene
 
 
 def draw_route(graph: LinkGraph, demand: DemandModel, *, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Draw origin, destination and way of one drive.
+    """Draw the origin, the destination and the route of one drive.
 
     Every driver perceives the time of every link with an error of his own, so that two drives between the same
     places may differ, and takes the way that seems shortest.
@@ -167,7 +167,7 @@ def route_moves(graph: LinkGraph, route: NDArray[np.int64]) -> NDArray[np.int64]
 
 
 def _path(before: NDArray[np.int32], origin: int, end: int) -> NDArray[np.int64]:
-    """Follow the predecessors back from the end."""
+    """Follow the predecessors back from the destination."""
     links = [end]
     while links[-1] != origin:
         links.append(int(before[links[-1]]))
@@ -175,7 +175,7 @@ def _path(before: NDArray[np.int32], origin: int, end: int) -> NDArray[np.int64]
 
 
 def _numbered_movements(network: RoadNetwork, section: NDArray[np.int64], direction: NDArray[np.int64]) -> pd.DataFrame:
-    """Return the network's movements with link numbers, sorted by them; U-turns only where nothing else leads on."""
+    """Return the network's movements with link numbers, sorted; U-turns only where no other movement is possible."""
     ids = network.sections.index.to_numpy()[section]
     number = pd.Series(np.arange(len(section)), index=pd.MultiIndex.from_arrays([ids, direction]))
     moves = network.movements()
@@ -192,7 +192,7 @@ def _numbered_movements(network: RoadNetwork, section: NDArray[np.int64], direct
 
 
 def _right_of_way(moves: pd.DataFrame, highway: NDArray[np.object_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Mark the movements that pass a junction at grade, and those of them that give way to a bigger road."""
+    """Mark the movements through a junction at grade, and those among them that yield to a larger road."""
     rank = _importance(highway)
     sharp = moves["turn"].abs() > _SHARP_TURN
     at_grade = sharp.groupby(moves["via_node"]).transform("any").to_numpy()
@@ -205,7 +205,7 @@ def _right_of_way(moves: pd.DataFrame, highway: NDArray[np.object_]) -> tuple[ND
 
 
 def _importance(highway: NDArray[np.object_]) -> NDArray[np.int64]:
-    """Rank of each class, larger is more important; a link road ranks half a step below its class."""
+    """Return the rank of each class, larger for more important ones; a link road is half a rank below its class."""
     order = ("residential", "unclassified", "tertiary", "secondary", "primary", "trunk", "motorway")
     rank = {name: 2 * position for position, name in enumerate(order)}
     return np.array(
@@ -221,7 +221,7 @@ def _weights(
     demand: DemandModel,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Origin probability and destination weight of every link."""
+    """Return the origin probability and the destination weight of every link."""
     n = len(highway)
     by_class = np.array([demand.class_weight.get(str(name), demand.other_weight) for name in highway])
     inner_class = np.array(["motorway" not in str(name) and _LINK_SUFFIX not in str(name) for name in highway])

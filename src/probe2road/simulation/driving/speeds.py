@@ -1,4 +1,4 @@
-"""How fast a vehicle drives along its path, where it stops, and how it wanders in its lane."""
+"""The speed of a vehicle along its path, where it stops, and how it moves laterally in its lane."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CRAWL = 0.8  # m/s; the slowest that a moving vehicle goes, so that time stays 
 @dataclass(frozen=True)
 @checked
 class DriverModel:
-    """How people drive."""
+    """How drivers choose speeds, stops and their position in the lane."""
 
     speed_bias: Positive[float] = 1.0  # chosen speed over the limit, median over drivers
     speed_spread: NotNegative[float] = 0.08  # between drivers, standard deviation of the logarithm
@@ -45,7 +45,7 @@ class DriverModel:
 
 @dataclass(frozen=True)
 class Journey:
-    """Times at which a vehicle passes the samples of its path."""
+    """The times at which a vehicle passes the samples of its path."""
 
     time: NDArray[np.float64]  # (n,) s since departure, when the vehicle leaves the sample
     wait: NDArray[np.float64]  # (n,) s that it has stood there before
@@ -61,7 +61,7 @@ def drive_along(
     spacing: float,
     rng: np.random.Generator,
 ) -> Journey:
-    """Drive along a path.
+    """Drive a vehicle along a path, and return when it passes each sample.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def drive_along(
 
 
 def lane_wander(steps: NDArray[np.float64], model: DriverModel, *, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw a vehicle's lateral distance from the middle of its lane.
+    """Draw a vehicle's lateral offsets from the middle of its lane.
 
     A constant of the vehicle plus a critically damped second-order process, whose position and lateral speed are
     both continuous: vehicles weave, they do not jitter.
@@ -127,7 +127,7 @@ def lane_wander(steps: NDArray[np.float64], model: DriverModel, *, rng: np.rando
 
 
 def _process(n: int, step: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw a unit Gauss-Markov process along the path, coarsely and interpolated: its change is slow."""
+    """Draw a unit Gauss-Markov process along the path, coarsely sampled and interpolated because it changes slowly."""
     stride = max(int(0.02 / step), 1)
     coarse = rng.standard_normal(n // stride + 2)
     decay = np.exp(-stride * step)
@@ -137,7 +137,7 @@ def _process(n: int, step: float, rng: np.random.Generator) -> NDArray[np.float6
 
 @njit(cache=True)
 def _first_order(values: NDArray[np.float64], decay: float) -> NDArray[np.float64]:
-    """Filter fresh noise by a first-order recursion."""
+    """Filter new white noise by a first-order recursion."""
     out = values.copy()
     for i in range(1, len(out)):
         out[i] += decay * out[i - 1]
@@ -148,7 +148,7 @@ def _first_order(values: NDArray[np.float64], decay: float) -> NDArray[np.float6
 def _feasible(
     ceiling: NDArray[np.float64], acceleration: float, deceleration: float, spacing: float
 ) -> NDArray[np.float64]:
-    """Lower a speed ceiling until every change of speed is within the vehicle's reach."""
+    """Lower a speed limit along the path until the vehicle can accelerate and brake to follow it."""
     speed = ceiling.copy()
     for i in range(1, len(speed)):
         speed[i] = min(speed[i], np.sqrt(speed[i - 1] ** 2 + 2.0 * acceleration * spacing))

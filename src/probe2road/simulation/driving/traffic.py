@@ -1,4 +1,4 @@
-"""Traffic: one drive after another, each a vehicle that follows a route through the network.
+"""Traffic: one drive after another, each of one vehicle on a route through the network.
 
 What comes out are true poses. What the vehicle believes, and sees, is the business of the sensors.
 """
@@ -25,7 +25,7 @@ _WINDOW = (0.1, 0.9)  # share of a link in which lanes are changed
 
 @dataclass(frozen=True)
 class TrafficWorld:
-    """A network prepared for driving, in flat arrays that travel to worker processes."""
+    """A network prepared for driving, as flat arrays that can be sent to worker processes."""
 
     graph: LinkGraph
     lanes: LinkLanes
@@ -35,7 +35,7 @@ class TrafficWorld:
 
 @dataclass(frozen=True)
 class TruePoses:
-    """Where one vehicle truly was: n poses, one for each stretch driven and further ones while it stood."""
+    """The true positions of a vehicle: n poses, one for each stretch driven, and more while it stood."""
 
     route: NDArray[np.int64]  # (m,) links in driving order
     t: NDArray[np.float64]  # (n,) s since departure
@@ -48,7 +48,7 @@ class TruePoses:
 
     @property
     def length(self) -> float:
-        """Metres driven."""
+        """Return the driven distance, metres."""
         return float(self.distance[-1]) if len(self.distance) else 0.0
 
 
@@ -123,7 +123,7 @@ def _path(world: TrafficWorld, route: NDArray[np.int64], driver: DriverModel, rn
 def _waits(
     graph: LinkGraph, route: NDArray[np.int64], path: DrivenPath, driver: DriverModel, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Draw where the vehicle stops, and for how many seconds: shape ``(n,)``, one value a path sample."""
+    """Draw where the vehicle stops, and for how many seconds: shape ``(n,)``, one value for each path sample."""
     wait = np.zeros(len(path.position))
     moves = route_moves(graph, route)
     draw, pause = rng.random(len(moves)), rng.exponential(size=len(moves))
@@ -165,7 +165,7 @@ def _poses(
     driver: DriverModel,
     rng: np.random.Generator,
 ) -> TruePoses:
-    """Place the vehicle on its path, and let it wander beside it."""
+    """Place the vehicle on its path, with a lateral offset that varies along it."""
     grid = np.arange(len(path.heading)) * PATH_SPACING
     heading = np.interp(s, grid, path.heading)
     speed = np.interp(s, grid, journey.speed)

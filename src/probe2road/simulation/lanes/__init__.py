@@ -1,4 +1,4 @@
-"""Lanes of a network and what is painted and built along them."""
+"""The lanes of a network, and the markings and boundaries along them."""
 
 from pkgutil import iter_modules
 

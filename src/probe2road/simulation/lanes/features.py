@@ -1,4 +1,4 @@
-"""What a camera sees beside the road: lane markings and road boundaries, in three dimensions.
+"""Features that a camera sees beside the road: lane markings and road boundaries, in three dimensions.
 
 Strategy
 --------
@@ -65,7 +65,7 @@ class RoadFeatures:
 
 
 def road_features(network: RoadNetwork, *, rng: np.random.Generator | None = None) -> RoadFeatures:
-    """Paint the markings and set the boundaries of a network, in three dimensions.
+    """Return the lane markings and road boundaries of a network, in three dimensions.
 
     Edges of the carriageway are solid; lanes of one direction are divided by the country's dashes; the directions of a
     two-way road by a solid line where it has more than two lanes or the country paints it so, else by dashes. Motorways
@@ -114,7 +114,7 @@ def road_features(network: RoadNetwork, *, rng: np.random.Generator | None = Non
 
 
 def _painted_lines(network: RoadNetwork) -> pd.DataFrame:
-    """One row a marking: section ``row``, lateral columns, ``style``, ``dash`` and ``period`` (m, NaN where solid)."""
+    """Return one row a marking: section ``row``, lateral columns, ``style``, ``dash`` and ``period`` (m, or NaN)."""
     borders, sections, paint = lane_borders(network), network.sections, network.markings
     row = pd.Index(sections.index).get_indexer(borders["section"])
     fast = sections["highway"].str.startswith(("motorway", "trunk")).to_numpy()[row]
@@ -133,7 +133,7 @@ def _painted_lines(network: RoadNetwork) -> pd.DataFrame:
 
 
 def _boundary_lines(network: RoadNetwork) -> pd.DataFrame:
-    """One row a boundary: the outermost borders moved outwards."""
+    """Return one row for each boundary: the outermost borders, moved outwards."""
     borders, sections, paint = lane_borders(network), network.sections, network.markings
     edges = borders[borders["style"] == "edge"].reset_index(drop=True)
     row = pd.Index(sections.index).get_indexer(edges["section"])
@@ -219,7 +219,7 @@ def _on_other_roads(
 
 
 def _continues(network: RoadNetwork, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell which pairs of section rows go on from one another."""
+    """Tell which pairs of section rows continue each other."""
     moves = network.movements()
     moves = moves[moves["turn"].abs() < _CONTINUES]
     a, b = (network.sections.index.get_indexer(moves[f"{end}_section"]) for end in ("from", "to"))
@@ -229,7 +229,7 @@ def _continues(network: RoadNetwork, i: NDArray[np.int64], j: NDArray[np.int64])
 
 
 def _present(lines: pd.DataFrame, samples: pd.DataFrame, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Draw where boundaries are present, block by block; markings are present everywhere."""
+    """Draw where boundaries are present, block by block; markings are always present."""
     line, style = samples["line"].to_numpy(), lines["style"].to_numpy()
     length, share = np.full(len(FEATURE_STYLES), np.inf), np.ones(len(FEATURE_STYLES))
     for name, (block, probability) in _BLOCKS.items():
@@ -242,7 +242,7 @@ def _present(lines: pd.DataFrame, samples: pd.DataFrame, rng: np.random.Generato
 
 
 def _runs(samples: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Cut lines into unbroken runs of two kept samples or more: vertices, run lengths, line of each run."""
+    """Cut lines into unbroken runs of two or more kept samples: return vertices, run lengths, and the line of a run."""
     line, keep = samples["line"].to_numpy(), samples["keep"].to_numpy()
     starts = keep.copy()
     starts[1:] &= ~keep[:-1] | (np.diff(line) != 0)
@@ -256,7 +256,7 @@ def _runs(samples: pd.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.int64]
 def _dashes(
     lines: pd.DataFrame, samples: pd.DataFrame, frame: SectionFrame
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Lay dashes along dashed lines, where the samples beside them are kept: as `_runs`."""
+    """Place dashes along dashed lines where the samples beside them are kept; return the same as `_runs`."""
     dashed = np.flatnonzero(lines["dash"].notna())
     row = lines["row"].to_numpy()[dashed]
     period, dash = (lines[name].to_numpy()[dashed] for name in ("period", "dash"))

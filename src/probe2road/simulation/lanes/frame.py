@@ -1,4 +1,4 @@
-"""The curvilinear frame of a network: from a section, a distance along it and a lateral offset to a position.
+"""The curvilinear frame of a network: from section, distance along it and lateral offset to a position.
 
 Strategy
 --------
@@ -49,7 +49,7 @@ class SectionFrame:
 
     @classmethod
     def from_network(cls, network: RoadNetwork) -> SectionFrame:
-        """Lay out the frame of a network."""
+        """Compute the frame of a network."""
         xyz, offsets = network.vertices()
         head = np.zeros(len(xyz), dtype=bool)
         head[offsets[:-1]] = True
@@ -63,7 +63,7 @@ class SectionFrame:
     def positions(
         self, row: NDArray[np.int64], s: NDArray[np.float64], offset: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return positions at distances along section rows, moved to the right by an offset; shape ``(k, 3)``.
+        """Return positions at distances along section rows and offsets to the right; shape ``(k, 3)``.
 
         Distances outside the section are taken at its ends.
 
@@ -81,7 +81,7 @@ class SectionFrame:
         return place
 
     def lateral(self, row: NDArray[np.int64], s: NDArray[np.float64], xy: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far to the right of a section positions lie (m), given the distances s that they project to."""
+        """Return how far to the right of a section positions lie (m), given their distances s along it."""
         before, weight = self._locate(row, s)
         w = weight[:, None]
         on_line = self.xyz[before, :2] * (1 - w) + self.xyz[before + 1, :2] * w
@@ -103,7 +103,7 @@ class SectionFrame:
 
 
 def _vertex_tangents(xy: NDArray[np.float64], head: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Average the directions of the steps before and after every vertex; ends have one step only."""
+    """Return the mean direction of the steps before and after every vertex; ends have only one step."""
     step = np.diff(xy, axis=0)
     unit = step / np.maximum(np.hypot(*step.T), _MIN_STEP)[:, None]
     unit[head[1:]] = 0.0  # from the end of one section to the start of the next
@@ -114,7 +114,7 @@ def _vertex_tangents(xy: NDArray[np.float64], head: NDArray[np.bool_]) -> NDArra
 
 
 def _join_tangents(tangent: NDArray[np.float64], network: RoadNetwork, offsets: NDArray[np.int64]) -> None:
-    """Let the two section ends at a node without others share their direction, in place."""
+    """Give two section ends at a node without others the same direction, in place."""
     node = network.sections[["u", "v"]].to_numpy().ravel()
     vertex = np.column_stack([offsets[:-1], offsets[1:] - 1]).ravel()
     sign = np.tile([1.0, -1.0], len(offsets) - 1)  # outward from the node

@@ -1,4 +1,4 @@
-"""How lanes meet where sections join: which section keeps its lanes, and where on it the others start or end.
+"""The lanes at joins of sections: which section keeps its lanes, and where on it the lanes of others start or end.
 
 Strategy
 --------
@@ -23,7 +23,7 @@ _THROUGH = 60.0  # degrees; lanes connect where the heading changes by less than
 
 
 def adapted_ends(network: RoadNetwork) -> pd.DataFrame:
-    """Find the ends of sections whose lanes take their places from another section.
+    """Find the ends of sections whose lanes are aligned with those of another section.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def _travel_lanes(network: RoadNetwork) -> pd.DataFrame:
 
 
 def _place(moves: pd.DataFrame, *, host: str, guest: str, end: str, lone_right: bool) -> pd.DataFrame:
-    """Spread the guests of each host from its left to its right edge, in the order of their turns."""
+    """Distribute the guest sections of each host from its left to its right edge, in the order of their turns."""
     key = [f"{host}_section", f"{host}_direction", "via_node"]
     # To the right leaves what turns right at the node; from the right comes what has to turn right to go on.
     groups = moves.groupby(key)["turn"]
@@ -74,7 +74,7 @@ def _place(moves: pd.DataFrame, *, host: str, guest: str, end: str, lone_right: 
 
 
 def _two_way_ends(moves: pd.DataFrame, left_hand: bool) -> pd.DataFrame:
-    """Align the centre lines of two two-way sections that continue each other with different lane counts."""
+    """Align the centre lines of two consecutive two-way sections with different lane counts."""
     both = moves[~moves["from_one_way"] & ~moves["to_one_way"]]
     pair = ["from_section", "to_section", "via_node"]
     alone = both.groupby(["from_section", "from_direction", "via_node"])["turn"].transform("size") == 1

@@ -1,4 +1,4 @@
-"""Lanes in the plane of the road: where each one lies on its section, and how it meets the next section's.
+"""Lanes in plan: the position of each lane on its section, and how it continues on the next section.
 
 Away from its ends a section carries its lanes side by side, symmetric about its line. At an end they take the place
 that `lane_ends` finds for them, and move from there to their own along a taper. Borders, and with them lanes, are
@@ -67,7 +67,7 @@ def lane_offsets(network: RoadNetwork) -> pd.DataFrame:
 
 
 def lane_borders(network: RoadNetwork) -> pd.DataFrame:
-    """Return the lateral position of every lane border along its section, edges of the carriageway included.
+    """Return the lateral position of every lane border along its section, including the edges of the carriageway.
 
     Returns
     -------
@@ -142,7 +142,7 @@ def lateral_offset(table: pd.DataFrame, s: ArrayLike, length: ArrayLike) -> NDAr
 
 
 def taper_length(speed_limit: ArrayLike, length: ArrayLike) -> NDArray[np.float64]:
-    """Return the length (m) over which lanes move to their place at each end of a section.
+    """Return the length (m) over which lanes move to their position at each end of a section.
 
     Examples
     --------
@@ -154,7 +154,7 @@ def taper_length(speed_limit: ArrayLike, length: ArrayLike) -> NDArray[np.float6
 
 
 def fade(t: ArrayLike) -> NDArray[np.float64]:
-    """Step smoothly from 1 at 0 to 0 at 1.
+    """Return a smooth step from 1 at 0 to 0 at 1.
 
     Examples
     --------

@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _Problem:
-    """The sparse rows of a height problem over v unknowns; r rows each.
+    """The sparse rows of a least-squares problem for heights, with v unknowns and r rows each.
 
     ``steep`` and ``bend`` are two-sided: their absolute value is limited.
     """
@@ -57,7 +57,7 @@ class _Problem:
 def solve_heights(
     network: RoadNetwork, *, rng: np.random.Generator, options: ProfileOptions | None = None
 ) -> RoadNetwork:
-    """Give every vertex of a network a height.
+    """Compute the height of every vertex of a network.
 
     Parameters
     ----------
@@ -116,22 +116,23 @@ def _problem(
     options: ProfileOptions,
     rng: np.random.Generator,
 ) -> _Problem:
-    """Lay out terrain, grade, change of grade and clearance over the unknowns."""
+    """Set up the terms for terrain, grade, change of grade and clearance in the unknowns."""
     size = int(unknown.max()) + 1
-    a, owner, step = steps(xyz, offsets)
+    first_vertex, owner, step = steps(xyz, offsets)
+    start, stop = unknown[first_vertex], unknown[first_vertex + 1]
     raised = (network.sections["bridge"] | network.sections["tunnel"]).to_numpy()[owner]
     share = np.where(raised, options.raised_pull, 1.0) * step / 2.0
-    pull = np.asarray(np.bincount(unknown[a], share, size) + np.bincount(unknown[a + 1], share, size), float)
-    is_raised = np.bincount(unknown[a], raised, size) + np.bincount(unknown[a + 1], raised, size) > 0
+    pull = np.asarray(np.bincount(start, share, size) + np.bincount(stop, share, size), float)
+    is_raised = np.bincount(start, raised, size) + np.bincount(stop, raised, size) > 0
     place = np.zeros((size, 2))
     place[unknown] = xyz[:, :2]
     terrain = Terrain.from_rng(rng, relief=options.terrain_relief, scale=options.terrain_scale).height(place)
-    before, middle, after, first, second = bends(network, offsets, unknown, a, step)
+    before, middle, after, first, second = bends(network, offsets, unknown, first_vertex, step)
     mean = (first + second) / 2.0
     bend = _rows([before, middle, after], [1.0 / first, -1.0 / first - 1.0 / second, 1.0 / second], size)
-    up, w = crossings.upper_vertex, crossings.upper_weight
-    down, x = crossings.lower_vertex, crossings.lower_weight
-    places = [unknown[up], unknown[up + 1], unknown[down], unknown[down + 1]]
+    upper, upper_weight = crossings.upper_vertex, crossings.upper_weight
+    lower, lower_weight = crossings.lower_vertex, crossings.lower_weight
+    places = [unknown[upper], unknown[upper + 1], unknown[lower], unknown[lower + 1]]
     return _Problem(
         terrain=terrain,
         pull=pull,
@@ -139,15 +140,15 @@ def _problem(
         bend=bend,
         bend_weight=options.smoothing**4 / mean,
         bend_limit=mean / options.vertical_radius,
-        steep=_rows([unknown[a], unknown[a + 1]], [-np.ones(len(a)), np.ones(len(a))], size),
+        steep=_rows([start, stop], [-np.ones(len(start)), np.ones(len(start))], size),
         steep_limit=grade_limits(network)[owner] * step,
-        clear=_rows(places, [1 - w, w, x - 1, -x], size),
+        clear=_rows(places, [1 - upper_weight, upper_weight, lower_weight - 1, -lower_weight], size),
         clear_weight=np.where(crossings.table["rule"] == "ambiguous", _DOUBTFUL_WEIGHT, _CLEAR_WEIGHT),
     )
 
 
 def _rows(columns: list[NDArray[np.int64]], values: list[NDArray[np.float64]], size: int) -> sparse.csr_array:
-    """Assemble a sparse matrix; each position within a row has one array of columns and one of values."""
+    """Build a sparse matrix from arrays of columns and values, one pair for each position within a row."""
     count = len(columns[0])
     row = np.tile(np.arange(count), len(columns))
     return sparse.csr_array((np.concatenate(values), (row, np.concatenate(columns))), shape=(count, size))
@@ -176,7 +177,7 @@ def _minimise(problem: _Problem, options: ProfileOptions) -> tuple[NDArray[np.fl
 def _active_system(
     problem: _Problem, z: NDArray[np.float64], options: ProfileOptions
 ) -> tuple[sparse.csr_array, NDArray[np.float64]]:
-    """Assemble the normal equations of the terms that are active at z."""
+    """Return the normal equations of the terms that are active at z."""
     pull = problem.pull * np.where(problem.open_road & (z < problem.terrain), options.lift, 1.0)
     matrix = sparse.diags_array(pull) + problem.bend.T @ sparse.diags_array(problem.bend_weight) @ problem.bend
     right = pull * problem.terrain

@@ -1,4 +1,4 @@
-"""Where one road passes over another: every plan crossing and every stretch of stacked roads, with its order.
+"""Places where one road passes over another: plan crossings and stretches of stacked roads, with their order.
 
 Strategy
 --------
@@ -63,7 +63,7 @@ class Crossings:
 
 
 def find_crossings(network: RoadNetwork) -> Crossings:
-    """Find every place where one road passes over another, and which is above.
+    """Find every place where one road passes over another, and which road is above.
 
     The order at a place follows from ``layer``; where layers are equal a bridge lies above and a tunnel below; where
     that does not decide either, the order is ``"ambiguous"`` and the road of the lower class, then of the higher id,
@@ -111,7 +111,7 @@ def find_crossings(network: RoadNetwork) -> Crossings:
 
 
 def _crossing_points(network: RoadNetwork, lines: NDArray[np.object_]) -> pd.DataFrame:
-    """Intersect all lines in plan: rows i < j of the sections, x, y, without their common nodes."""
+    """Intersect all lines in plan: return section rows i < j, and x, y, without the common nodes of sections."""
     i, j = shapely.STRtree(lines).query(lines, predicate="intersects")
     keep = i < j
     i, j = i[keep], j[keep]
@@ -167,7 +167,7 @@ def _overlaps(network: RoadNetwork, lines: NDArray[np.object_], points: pd.DataF
 
 
 def _beside(lines: NDArray[np.object_], row: NDArray[np.int64], where: NDArray[np.object_]) -> NDArray[np.bool_]:
-    """Tell which places project inside a line rather than onto its ends (what lies beyond, the next section covers)."""
+    """Tell which places project to the inside of a line; a place beyond its ends belongs to the next section."""
     s = shapely.line_locate_point(lines[row], where)
     return np.asarray((s > 1e-6) & (s < shapely.length(lines[row]) - 1e-6))
 
@@ -175,7 +175,7 @@ def _beside(lines: NDArray[np.object_], row: NDArray[np.int64], where: NDArray[n
 def _at_abutment(
     network: RoadNetwork, lines: NDArray[np.object_], row: NDArray[np.int64], where: NDArray[np.object_]
 ) -> NDArray[np.bool_]:
-    """Tell which places on sections are near an end where a bridge or tunnel meets open road, or ends."""
+    """Tell which places are near an end of their section where a bridge or tunnel ends or meets open road."""
     sections = network.sections
     raised = sections["bridge"] | sections["tunnel"]
     ends = pd.concat([sections["u"], sections["v"]]).to_frame("node").assign(raised=np.tile(raised.to_numpy(), 2))
@@ -189,7 +189,7 @@ def _at_abutment(
 
 
 def _order(network: RoadNetwork, i: NDArray[np.int64], j: NDArray[np.int64]) -> pd.DataFrame:
-    """Decide which of two section rows lies above: ``first_above`` and the ``rule`` that says so."""
+    """Decide which of two sections lies above: return ``first_above``, and the ``rule`` that decided."""
     sections = network.sections
     layer = sections["layer"].to_numpy()
     raised = sections["bridge"].to_numpy().astype(int) - sections["tunnel"].to_numpy().astype(int)
@@ -224,7 +224,7 @@ def _near_by_road(
     j: NDArray[np.int64],
     where: NDArray[np.object_],
 ) -> NDArray[np.bool_]:
-    """Tell which places on two sections are within ramp reach of each other along the roads."""
+    """Tell which places on two sections are within the length of a ramp of each other along the roads."""
     if not len(i):
         return np.zeros(0, dtype=bool)
     ends = end_rows(network.nodes, network.sections)

@@ -1,4 +1,4 @@
-"""Measure the heights of a network: clearances, grades, changes of grade, continuity."""
+"""Measurement of the heights of a network: clearances, grades, changes of grade, continuity."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NEAR = 400.0  # m; a crossing this near can be why a grade is steep
 
 @dataclass(frozen=True)
 class HeightReport:
-    """The heights of a network, checked.
+    """The measured heights of a network, and the violations of their limits.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ def _grades(
 def _curvatures(
     network: RoadNetwork, xyz: NDArray[np.float64], offsets: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return a section row, the middle vertex and the vertical curvature (1/m) for every bend."""
+    """Return the section row, the middle vertex and the vertical curvature (1/m) of every bend."""
     unknown = vertex_unknowns(network, offsets)
     vertex, _, step = steps(xyz, offsets)
     before, middle, after, first, second = bends(network, offsets, unknown, vertex, step)
@@ -118,7 +118,7 @@ def _worst_places(
     value: NDArray[np.float64],
     limit: NDArray[np.float64],
 ) -> pd.DataFrame:
-    """Return for each section the place where a value passes its limit the most, if any."""
+    """Return for each section the place where a value exceeds its limit the most, if any."""
     table = pd.DataFrame({"row": row, "vertex": vertex, "value": value, "limit": limit})[value > limit]
     table = table.sort_values("value", ascending=False).drop_duplicates("row").sort_values("row")
     x, y = xyz[table["vertex"], 0], xyz[table["vertex"], 1]
@@ -135,7 +135,7 @@ def _largest_gap(network: RoadNetwork, xyz: NDArray[np.float64], offsets: NDArra
 
 
 def _causes(violations: pd.DataFrame, crossings: pd.DataFrame) -> list[str]:
-    """Say for each violation what in the input leads to it."""
+    """Return the cause of each violation in the input."""
     ambiguous = crossings[crossings["rule"] == "ambiguous"]
     doubtful = set(ambiguous["upper"]) | set(ambiguous["lower"])
     places = crossings[["x", "y"]].to_numpy()

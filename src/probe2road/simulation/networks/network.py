@@ -1,4 +1,4 @@
-"""The road network that the simulator drives on: directed sections with lanes, in three dimensions.
+"""The road network of the simulator: directed sections with lanes, in three dimensions.
 
 A section is a stretch of one carriageway between two nodes, drawn from ``u`` to ``v``: in the driving direction
 where it is one-way. Its line is the middle of all its lanes. Sections meet only at nodes; where two lines cross
@@ -62,7 +62,7 @@ _U_TURN = 150.0  # degrees; a sharper change of heading at a node is a U-turn
 
 @dataclass(frozen=True)
 class NetworkReport:
-    """What a reader found, repaired and left out; all zero for a generated network."""
+    """Counts of what a reader found, repaired and left out; all zero for a generated network."""
 
     ways: int = 0  # ways of the wanted classes
     missing_nodes: int = 0  # node references without a position
@@ -108,16 +108,16 @@ class RoadNetwork:
 
     @property
     def crs(self) -> CRS:
-        """Metric CRS of nodes and sections."""
+        """Return the metric CRS of nodes and sections."""
         return self.sections.crs
 
     @property
     def length(self) -> float:
-        """Total length of the sections in plan, metres."""
+        """Return the total length of the sections in plan, metres."""
         return float(self.sections.length.sum())
 
     def vertices(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the vertices of all sections, flat.
+        """Return the vertices of all sections as flat arrays.
 
         Returns
         -------
@@ -166,7 +166,7 @@ class RoadNetwork:
         return allowed.sort_values(order, ignore_index=True)
 
     def reference_graph(self) -> RoadGraph:
-        """Return the true road graph: topology, geometry with heights, and what crosses over what.
+        """Return the true road graph: topology, geometry with heights, and which roads pass over which.
 
         One edge a section, with the section's id; ``highway``, ``bridge``, ``tunnel``, ``layer``, ``oneway`` and
         ``section`` are kept as further columns, and ``origin`` is ``"reference"``.
@@ -184,7 +184,7 @@ class RoadNetwork:
         return RoadGraph(self.nodes, finish_edges(edges), empty_turns())
 
     def _directed_ends(self) -> pd.DataFrame:
-        """One row for each section and driving direction: its end nodes, and its headings there (degrees)."""
+        """Return one row for each section and driving direction: its end nodes, and its headings there (degrees)."""
         _, away = line_ends(self.sections.geometry.to_numpy(), reach=_HEADING_REACH)
         start, end = _heading(away[0::2]), _heading(-away[1::2])
         table = {"section": self.sections.index.to_numpy(), "u": self.sections["u"].to_numpy()}
@@ -216,7 +216,7 @@ def network_from_sections(
     snap: float = 0.01,
     **columns: Any,
 ) -> RoadNetwork:
-    """Build a network from lines that meet at their ends; what is not given follows from the road class.
+    """Build a network from lines that meet at their ends; missing properties follow from the road class.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def network_from_sections(
 
 
 def check_network(network: RoadNetwork, *, where: object = "network") -> None:
-    """Verify the invariants of a road network.
+    """Check the invariants of a road network, and report all faults at once.
 
     Raises
     ------
@@ -337,7 +337,7 @@ def _section_table(sections: Any, crs: Any) -> gpd.GeoDataFrame:
 
 
 def _fill_defaults(table: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    """Fill absent section columns from the highway class."""
+    """Fill missing section columns from the highway class."""
     if "highway" not in table:
         table["highway"] = "motorway"
     unknown = sorted(set(table["highway"]) - set(CLASS_DEFAULTS))
@@ -360,7 +360,7 @@ def _fill_defaults(table: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
 
 
 def _join_ends(lines: NDArray[Any], snap: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Give line ends at one plan position one number, by first appearance."""
+    """Give line ends at the same position in plan one number, in the order of first appearance."""
     first, last = (shapely.get_coordinates(shapely.get_point(lines, end)) for end in (0, -1))
     cells = np.round(np.stack([first, last], axis=1).reshape(-1, 2) / snap).astype(np.int64)
     node, _ = pd.factorize(pd.MultiIndex.from_arrays(cells.T))
@@ -385,5 +385,5 @@ def _nodes_at_ends(
 
 
 def _heading(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Heading of vectors, shape ``(n, 2)``, degrees clockwise from north."""
+    """Return the heading of vectors, shape ``(n, 2)``, degrees clockwise from north."""
     return np.degrees(np.arctan2(vector[:, 0], vector[:, 1])) % 360.0

@@ -1,4 +1,4 @@
-"""Read a road network for the simulator from an OpenStreetMap file.
+"""Reading of road networks for the simulator from OpenStreetMap files.
 
 Ways of the wanted classes are split where they meet, one-way ways are turned into their driving direction, lanes and
 speeds come from tags or from the class, and heights are solved, because OpenStreetMap has none: its ``layer`` is only
@@ -144,7 +144,7 @@ def read_network(
 
 
 def _usable_ways(ways: OsmWays) -> OsmWays:
-    """Drop vertices at the place of the one before, then ways of fewer than two; turn ways that run against traffic."""
+    """Drop repeated vertices, then ways with fewer than two; reverse ways that run against the traffic."""
     same_way = np.diff(ways.way, prepend=-1) == 0
     same_node = np.diff(ways.refs, prepend=0) == 0
     same_place = (np.diff(ways.lon, prepend=0.0) == 0) & (np.diff(ways.lat, prepend=0.0) == 0)
@@ -156,7 +156,7 @@ def _usable_ways(ways: OsmWays) -> OsmWays:
 
 
 def _sections(ways: OsmWays, crs: Any) -> tuple[gpd.GeoDataFrame, Counter[str], Counter[str]]:
-    """Split ways at shared nodes and attach what their tags say."""
+    """Split ways at shared nodes, and add the values of their tags."""
     parts = split_at_shared_nodes(ways)
     drawn = ways.select_vertices(parts.vertex)
     x, y = transform(drawn.lon, drawn.lat, WGS84, crs)
@@ -172,7 +172,7 @@ def _sections(ways: OsmWays, crs: Any) -> tuple[gpd.GeoDataFrame, Counter[str], 
 
 
 def _columns(tags: Mapping[str, str], direction: int, defaulted: Counter[str], bad: Counter[str]) -> dict[str, Any]:
-    """Return the section columns that the tags and the direction of one way give; count defaults and nonsense."""
+    """Return the section columns from the tags and direction of a way, and count defaults and invalid values."""
     kind = CLASS_DEFAULTS[tags["highway"]]
     forward, backward = _lanes(tags, direction, defaulted, bad)
     speed = _speed(tags, defaulted, bad)
@@ -195,7 +195,7 @@ def _columns(tags: Mapping[str, str], direction: int, defaulted: Counter[str], b
 
 
 def _lanes(tags: Mapping[str, str], direction: int, defaulted: Counter[str], bad: Counter[str]) -> tuple[int, int]:
-    """Return the lanes in each direction; ``lanes`` counts both directions of a two-way road."""
+    """Return the lanes in each direction; ``lanes`` of a two-way road counts both directions."""
     kind = CLASS_DEFAULTS[tags["highway"]]
     total, forward, backward = (_integer(tags, key, bad, low=1) for key in ("lanes", "lanes:forward", "lanes:backward"))
     if direction == -1:
@@ -214,7 +214,7 @@ def _lanes(tags: Mapping[str, str], direction: int, defaulted: Counter[str], bad
 
 
 def _speed(tags: Mapping[str, str], defaulted: Counter[str], bad: Counter[str]) -> float | None:
-    """Return the speed limit (m/s), None where the class decides."""
+    """Return the speed limit (m/s), None if it follows from the class."""
     value = tags.get("maxspeed") or tags.get("maxspeed:forward")
     if value is None or value in _SPEED_UNKNOWN or ":" in value:
         defaulted["maxspeed"] += 1
@@ -229,7 +229,7 @@ def _speed(tags: Mapping[str, str], defaulted: Counter[str], bad: Counter[str]) 
 
 
 def _integer(tags: Mapping[str, str], key: str, bad: Counter[str], *, low: int | None = None) -> int | None:
-    """Return a whole number, None where the tag is absent or makes no sense (counted)."""
+    """Return a whole number, None if the tag is missing or invalid (which is counted)."""
     value = tags.get(key)
     if value is None:
         return None
@@ -240,7 +240,7 @@ def _integer(tags: Mapping[str, str], key: str, bad: Counter[str], *, low: int |
 
 
 def _guess_country(lon: float, lat: float) -> tuple[str, str]:
-    """Return (driving side, country of the marking style) at a position."""
+    """Return the driving side, and the country whose marking style is used, at a position."""
     for country, west, south, east, north, side in _COUNTRIES:
         if west <= lon <= east and south <= lat <= north:
             return side, country

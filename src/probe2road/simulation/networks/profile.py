@@ -1,4 +1,4 @@
-"""The grid of a height profile: its unknowns, the steps between them, and the bends from one step to the next."""
+"""The grid of a height profile: its unknowns, the steps between them, and the bends between the steps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _THROUGH = 60.0  # degrees; the grade continues from one section to the next whe
 @dataclass(frozen=True)
 @checked
 class ProfileOptions:
-    """What a height profile must keep, and how smooth it is."""
+    """The limits of a height profile, and its smoothness."""
 
     clearance: NotNegative[float] = 5.5  # m, from road surface to road surface
     margin: NotNegative[float] = 0.05  # m, solved for on top of the clearance
@@ -70,7 +70,7 @@ def bends(
     a: NDArray[np.int64],
     step: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the unknowns of three vertices in a row and the two steps between, inside sections and through nodes."""
+    """Return three consecutive unknowns and the two steps between them, inside sections and through nodes."""
     length = np.zeros(len(unknown))
     length[a] = step  # length of the step that starts at a vertex
     inner = np.flatnonzero(np.diff(a) == 1)

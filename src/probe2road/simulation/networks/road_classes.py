@@ -1,4 +1,4 @@
-"""What road classes and countries imply where no tag says otherwise: lanes, widths, speeds, grades, paint."""
+"""Defaults of road classes and countries where tags are missing: lanes, widths, speeds, grades, paint."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["CLASS_DEFAULTS", "MARKING_STYLES", "MarkingStyle", "RoadClass", "mar
 
 @dataclass(frozen=True)
 class RoadClass:
-    """What an OSM highway class means where tags are silent."""
+    """The properties of an OSM highway class where tags are missing."""
 
     lanes_oneway: int  # lanes of a one-way carriageway
     lanes_twoway: int  # lanes of a two-way carriageway, both directions together
@@ -42,7 +42,7 @@ CLASS_DEFAULTS: Mapping[str, RoadClass] = {
 
 @dataclass(frozen=True)
 class MarkingStyle:
-    """How a country paints its roads."""
+    """How the roads of a country are marked."""
 
     country: str  # ISO 3166 code
     dash: float  # m, painted length of a lane divider on motorways and trunk roads

@@ -1,4 +1,4 @@
-"""Gentle procedural terrain: the ground that roads follow where nothing lifts them."""
+"""Gentle procedural terrain: the ground on which roads lie where no structure raises them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Terrain:
 
     @classmethod
     def from_rng(cls, rng: np.random.Generator, *, relief: float, scale: float, waves: int = 24) -> Terrain:
-        """Draw a surface of a standard deviation (m) with wavelengths from ``scale`` (m) to four times that."""
+        """Draw a surface with a standard deviation (m) and wavelengths from ``scale`` (m) to four times that."""
         length = scale * 4.0 ** rng.random(waves)
         angle = rng.uniform(0.0, 2 * np.pi, waves)
         wave = (2 * np.pi / length)[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -29,7 +29,7 @@ class Terrain:
         return cls(wave, rng.uniform(0.0, 2 * np.pi, waves), amplitude, 10.0 + 3.0 * relief)
 
     def height(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Evaluate at positions (m), shape ``(n, 2)``; the surface repeats nowhere, so any metric CRS will do."""
+        """Return the heights at positions (m), shape ``(n, 2)``; the surface never repeats, so any metric CRS works."""
         total = np.full(len(xy), self.base)
         for wave, phase, amplitude in zip(self.wave, self.phase, self.amplitude, strict=True):
             total += amplitude * np.sin(xy @ wave + phase)

@@ -1,4 +1,4 @@
-"""What vehicles measure: GNSS, odometry, cameras."""
+"""The sensors of vehicles: GNSS, odometry, cameras."""
 
 from pkgutil import iter_modules
 

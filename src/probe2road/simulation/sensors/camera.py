@@ -1,4 +1,4 @@
-"""What a forward camera reports of the road: sparse, noisy points on lane markings and road boundaries.
+"""The points that a forward camera reports: sparse and noisy, on lane markings and road boundaries.
 
 Strategy
 --------
@@ -70,13 +70,13 @@ class CameraModel:
     altitude_slope: NotNegative[float]  # further allowance per metre of range
 
     def __post_init__(self) -> None:
-        """Refuse cameras that see nothing."""
+        """Refuse cameras that cannot see anything."""
         if self.near >= self.far:
             raise OptionError(f"near is {self.near}, far is {self.far}", where="CameraModel", fix="use near < far")
 
 
 class FeatureIndex(NamedTuple):
-    """Pieces of lines in the order of the cells that they lie in; n pieces, r x c cells.
+    """Pieces of lines, sorted by the cells in which they lie; n pieces, r x c cells.
 
     A named tuple, which compiled code takes whole.
     """
@@ -92,7 +92,7 @@ class FeatureIndex(NamedTuple):
 
 @dataclass(frozen=True)
 class Detections:
-    """Points that a camera reported on one drive, in the frame of the vehicle: n points."""
+    """The n points that a camera reported on one drive, in the frame of the vehicle."""
 
     keyframe: NDArray[np.int64]  # (n,) row of the pose
     body: NDArray[np.float64]  # (n, 3) m: forward, to the right, up from the road under the vehicle
@@ -101,7 +101,7 @@ class Detections:
 
 
 class _Keyframes(NamedTuple):
-    """A drive as the camera meets it: n keyframes."""
+    """The n keyframes of a drive at which the camera detects points."""
 
     xyz: NDArray[np.float64]  # (n, 3) m, from the origin of the index
     heading: NDArray[np.float64]  # (n,) radians clockwise from north
@@ -112,7 +112,7 @@ class _Keyframes(NamedTuple):
 
 
 class _View(NamedTuple):
-    """The part of a camera model that decides what is in view, in a form that compiled code can take."""
+    """The part of a camera model that decides what is in view, in a form for compiled code."""
 
     near: float  # m
     far: float  # m
@@ -134,7 +134,7 @@ def feature_index(
     kind: NDArray[np.int8],
     model: CameraModel,
 ) -> FeatureIndex:
-    """Cut lines into pieces and sort these into cells.
+    """Cut lines into pieces, and sort the pieces into cells.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def see(
     rng: np.random.Generator,
     vehicle_rng: np.random.Generator,
 ) -> Detections:
-    """Let a camera look along a drive.
+    """Return the points that a camera detects along a drive.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ def _with_noise(
 
 
 def _view(model: CameraModel) -> _View:
-    """Extract what decides whether a point is in view."""
+    """Return the parameters that decide whether a point is in view."""
     in_view = model.range_decay * (1.0 - np.exp((model.near - model.far) / model.range_decay))
     same = {name: getattr(model, name) for name in _View._fields if name not in ("slope", "in_view")}
     return _View(slope=float(np.tan(np.radians(model.half_angle))), in_view=float(in_view), **same)
@@ -261,7 +261,7 @@ def _view(model: CameraModel) -> _View:
 
 @njit(cache=True)
 def _pitch(steps: NDArray[np.float64], time: float, normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Turn white normal numbers into a unit Gauss-Markov process over the keyframes."""
+    """Return a unit Gauss-Markov process over the keyframes, made from white normal numbers."""
     out = normal.copy()
     for i in range(1, len(out)):
         fade = np.exp(-steps[i] / time)
@@ -273,7 +273,7 @@ def _pitch(steps: NDArray[np.float64], time: float, normal: NDArray[np.float64])
 def _alternating(
     driven: NDArray[np.float64], off_length: float, on_length: float, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """Two states that alternate along the road with exponential lengths of these means (m); True is on."""
+    """Draw two alternating states along the road with exponential lengths of given means (m); True is on."""
     state = np.zeros(len(driven), np.bool_)
     on = rng.random() < on_length / (on_length + off_length)
     for i in range(len(driven)):
@@ -285,7 +285,7 @@ def _alternating(
 
 
 def _vehicles(driven: NDArray[np.float64], model: CameraModel, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw other vehicles: nearest face ``(3, n)``, metres ahead, infinite where there is none.
+    """Draw other vehicles: the nearest face ``(3, n)`` in metres ahead, infinity for none.
 
     The first is in the own lane and keeps its distance, the others in the lanes to the left and right.
     """
@@ -308,7 +308,7 @@ def _vehicles(driven: NDArray[np.float64], model: CameraModel, rng: np.random.Ge
 def _detect(
     keyframes: _Keyframes, index: FeatureIndex, view: _View, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int8], NDArray[np.int64]]:
-    """Look from every keyframe: keyframe, true place in the vehicle frame, kind and line of each point reported."""
+    """Detect points from every keyframe: return their keyframe, true place in the vehicle frame, kind and line."""
     codes = [(0, 0, 0) for _ in range(0)]  # keyframe, kind, line; empty lists whose types the compiler can tell
     places = [(0.0, 0.0, 0.0) for _ in range(0)]
     pieces, kind, driven = index.pieces, index.kind, keyframes.driven
@@ -349,7 +349,7 @@ def _detect(
 
 @njit(cache=True)
 def _visibility(forward: float, right: float, up: float, kind: int, view: _View) -> float:
-    """Points that a piece of unit weight at this place yields on a metre driven; 0 where it is out of view."""
+    """Return the expected points on a piece of unit weight for each metre driven; 0 if it is out of view."""
     if forward < view.near or forward > view.far or abs(right) > view.slope * forward:
         return 0.0
     if abs(up) > view.altitude_gate + view.altitude_slope * forward:
@@ -365,7 +365,7 @@ def _visibility(forward: float, right: float, up: float, kind: int, view: _View)
 def _cells_in_view(
     x: float, y: float, sin: float, cos: float, view: _View, index: FeatureIndex
 ) -> tuple[int, int, int, int]:
-    """Columns ``c0:c1`` and rows ``r0:r1`` of the cells that may hold a piece in the field of view."""
+    """Return columns ``c0:c1`` and rows ``r0:r1`` of the cells that may hold a piece in the field of view."""
     columns, rows = index.columns, (len(index.cells) - 1) // index.columns
     low_x, high_x, low_y, high_y = np.inf, -np.inf, np.inf, -np.inf
     for forward in (view.near, view.far):
@@ -383,7 +383,7 @@ def _cells_in_view(
 
 @njit(cache=True)
 def _hidden(forward: float, right: float, vehicles: NDArray[np.float64]) -> bool:
-    """Whether the line of sight to a point passes through another vehicle.
+    """Tell whether another vehicle interrupts the line of sight to a point.
 
     A vehicle is the face that it turns to the camera: 1.8 m wide, in the middle of its lane, 3.5 m from lane to lane.
     """

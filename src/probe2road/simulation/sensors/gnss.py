@@ -1,4 +1,4 @@
-"""Errors of a GNSS receiver along a drive: correlated in time, heavy-tailed, worse where the sky is hidden.
+"""Errors of a GNSS receiver along a drive: correlated in time, heavy-tailed, larger where the sky is hidden.
 
 Strategy
 --------
@@ -29,7 +29,7 @@ _AWARENESS = 0.5  # share of a burst, on a logarithmic scale, that the receiver 
 @dataclass(frozen=True)
 @checked
 class GnssModel:
-    """Error statistics of a single-point GNSS solution, each horizontal axis alike."""
+    """Error statistics of a single-point GNSS solution, the same for both horizontal axes."""
 
     slow_sigma: NotNegative[float]  # m, of the slow Gauss-Markov process
     slow_time: Positive[float]  # s, its time constant
@@ -48,7 +48,7 @@ class GnssModel:
 
 @dataclass(frozen=True)
 class GnssErrors:
-    """Errors of n fixes."""
+    """The errors of n fixes."""
 
     error: NDArray[np.float64]  # (n, 3): east, north, up, m
     sigma: NDArray[np.float64]  # (n,): what the receiver believes of a horizontal axis, m
@@ -56,7 +56,7 @@ class GnssErrors:
 
 
 def gnss_errors(t: ArrayLike, model: GnssModel, *, rng: np.random.Generator, exposure: ArrayLike = 1.0) -> GnssErrors:
-    """Draw the errors of one receiver at given times.
+    """Draw the errors of one receiver at the given times.
 
     Parameters
     ----------
@@ -101,13 +101,13 @@ def gnss_errors(t: ArrayLike, model: GnssModel, *, rng: np.random.Generator, exp
 
 
 def _share(model: GnssModel) -> float:
-    """White share of a burst's error, at most all of it."""
+    """Return the white share of the error in a burst, at most 1."""
     return min(model.burst_white, 1.0)
 
 
 @njit(cache=True)
 def _gauss_markov(steps: NDArray[np.float64], time_constant: float, normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Turn white normal numbers ``(n, k)`` into unit Gauss-Markov processes with the given time steps (s)."""
+    """Return unit Gauss-Markov processes with the given time steps (s), made from white normal numbers ``(n, k)``."""
     out = normal.copy()
     for i in range(1, len(out)):
         decay = np.exp(-steps[i] / time_constant)
@@ -126,7 +126,7 @@ def _bursts(
     spread: float,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Draw the bursts: whether each fix is inside one, and its scale (m, 0 outside).
+    """Draw the bursts: whether each fix is inside one, and the scale of the burst (m, 0 outside).
 
     A two-state Markov chain in continuous time: bursts begin at ``rate`` and end at ``1 / duration``. Over one
     step the probability of being inside at its end is exact for the step's rate.

@@ -1,4 +1,4 @@
-"""What a vehicle believes about its pose: odometry that drifts, GNSS that pulls it back.
+"""The recorded pose of a vehicle: odometry that drifts, corrected by GNSS.
 
 Strategy
 --------
@@ -30,7 +30,7 @@ __all__ = ["FusedPoses", "FusionModel", "OdometryModel", "fuse"]
 @dataclass(frozen=True)
 @checked
 class OdometryModel:
-    """Errors of wheel and inertial odometry that calibration on the road leaves."""
+    """Errors of wheel and inertial odometry that remain after calibration on the road."""
 
     scale_sigma: NotNegative[float]  # of the distance driven, constant over a drive
     heading_sigma: NotNegative[float]  # degrees, of the heading error while GNSS is there
@@ -43,7 +43,7 @@ class OdometryModel:
 @dataclass(frozen=True)
 @checked
 class FusionModel:
-    """How GNSS and odometry become one pose."""
+    """How GNSS and odometry are combined to one pose."""
 
     pull_time: Positive[float]  # s, time constant with which good GNSS pulls the horizontal error
     vertical_pull_time: Positive[float]  # s, the same for the height
@@ -55,7 +55,7 @@ class FusionModel:
 
 @dataclass(frozen=True)
 class FusedPoses:
-    """What the vehicle records, beside its true poses."""
+    """The poses that a vehicle records of a drive."""
 
     xyz: NDArray[np.float64]  # (n, 3) m
     heading: NDArray[np.float64]  # (n,) radians clockwise from north
@@ -72,7 +72,7 @@ def fuse(
     rng: np.random.Generator,
     vehicle_rng: np.random.Generator,
 ) -> FusedPoses:
-    """Fuse odometry with GNSS along one drive.
+    """Combine odometry and GNSS along one drive.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def fuse(
 
 
 class _Tuning(NamedTuple):
-    """Both models with the constants of one drive drawn, in radians, in a form that compiled code can take."""
+    """Both models with the random constants of one drive, in radians, in a form for compiled code."""
 
     scale: float  # error of the distance driven
     gyro: float  # radians/s
@@ -123,7 +123,7 @@ class _Tuning(NamedTuple):
 
 
 def _tuning(odometry: OdometryModel, fusion: FusionModel, rng: np.random.Generator) -> _Tuning:
-    """Draw what is constant over a drive."""
+    """Draw the constants of one drive."""
     return _Tuning(
         scale=odometry.scale_sigma * float(rng.standard_normal()),
         gyro=float(np.radians(odometry.gyro_bias) * rng.standard_normal()),
@@ -143,7 +143,7 @@ def _tuning(odometry: OdometryModel, fusion: FusionModel, rng: np.random.Generat
 def _heading_error(
     steps: NDArray[np.float64], covered: NDArray[np.bool_], tuning: _Tuning, normal: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the heading error (radians): a Gauss-Markov process, and the drift of a gyroscope while GNSS is away."""
+    """Return the heading error (radians): a Gauss-Markov process, and gyroscope drift while GNSS is missing."""
     turned = np.zeros(len(steps))
     weave, drift = 0.0, 0.0
     for i in range(len(steps)):
@@ -169,7 +169,7 @@ def _position_error(
     tuning: _Tuning,
     normal: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the position error ``(n, 3)`` and the filter's own idea of it ``(n,)``, m."""
+    """Return the position error ``(n, 3)`` and the accuracy that the filter assumes ``(n,)``, m."""
     error, sigma = np.zeros((len(steps), 3)), np.zeros(len(steps))
     x, y, z, own = 0.0, 0.0, 0.0, 0.0
     if len(steps):
@@ -199,5 +199,5 @@ def _position_error(
 
 @njit(cache=True)
 def _clipped(value: float, limit: float) -> float:
-    """Clip to ``[-limit, limit]``."""
+    """Return a value clipped to ``[-limit, limit]``."""
     return min(max(value, -limit), limit)

@@ -1,4 +1,4 @@
-"""Lines drawn into a grid: masks of road graphs."""
+"""Lines drawn into pixel arrays: label masks of road graphs, and traces."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from probe2road.raster.grid import Grid
 
 __all__ = ["draw_line", "draw_lines", "label_mask"]
 
-_KEEP_NOTHING = np.uint8(0)  # lines make ones of whatever was there
+_KEEP_NOTHING = np.uint8(0)  # pixels on a line become 1, whatever they were
 
 
 def label_mask(graph: RoadGraph, grid: Grid, *, width: int = 1) -> NDArray[np.uint8]:
-    """Draw the edges of a graph as lines: 1 on a line, 0 elsewhere.
+    """Draw the edges of a graph as a mask: 1 on a line, 0 elsewhere.
 
     Lines of width 1 are Bresenham's, one pixel wide and connected over edges and corners of pixels. Wider lines are
     those dilated to a square of so many pixels (an even width reaches one pixel further up and left). What lies
@@ -66,7 +66,7 @@ def draw_lines(
     *,
     width: int = 1,
 ) -> NDArray[np.uint8]:
-    """Draw lines that are in pixel coordinates already; see `label_mask`.
+    """Draw lines that are already in pixel coordinates; see `label_mask`.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def draw_line(
     values: NDArray[np.unsignedinteger],
     keep: np.unsignedinteger,
 ) -> bool:
-    """Draw Bresenham's line between two pixels, both included, into an array; what lies outside is left out.
+    """Draw Bresenham's line between two pixels (both included) into an array; pixels outside are ignored.
 
     Every line is drawn from its northern (then western) end, because Bresenham's choice of pixels is not symmetric:
     so it does not matter which way an edge runs or a trace was driven. The line has ``n`` steps along its major axis,
@@ -180,7 +180,7 @@ def _draw(
     after: int,
     mask: NDArray[np.uint8],
 ) -> None:
-    """Set the pixels of the lines between the vertices of each owner, and ``before``/``after`` around them."""
+    """Draw lines between the vertices of each owner, widened by ``before`` and ``after`` pixels."""
     for k in range(1, len(row)):
         if owner[k] == owner[k - 1]:
             draw_line((row[k - 1], col[k - 1], row[k], col[k]), before, after, mask, _KEEP_NOTHING)
