@@ -11,6 +11,7 @@ import pandas as pd
 
 from probe2road.errors import OptionError
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.metrics.apart import ApartOptions, apart_networks
 from probe2road.metrics.apls import AplsOptions, apls_networks
 from probe2road.metrics.buffer import BufferGeoOptions, buffer_geo_networks
 from probe2road.metrics.geo import GeoOptions, geo_networks
@@ -35,6 +36,7 @@ MetricOptions = (
     | GraphSamplingOptions
     | JunctionOptions
     | LateralOptions
+    | ApartOptions
 )
 
 # The short names of metrics with their default parameters, for the command line and for quick calls.
@@ -48,6 +50,7 @@ METRICS: dict[str, MetricOptions] = {
     "graph_sampling": GraphSamplingOptions(),
     "junctions": JunctionOptions(),
     "lateral": LateralOptions(),
+    "apart": ApartOptions(),
 }
 DEFAULT_METRICS = ("geo", "itopo", "itopo_strict", "topo", "apls")
 
@@ -60,6 +63,7 @@ _SCORERS: dict[type, Callable[..., Score | list[Score]]] = {
     GraphSamplingOptions: graph_sampling_networks,
     JunctionOptions: junctions_networks,
     LateralOptions: lateral_networks,
+    ApartOptions: apart_networks,
 }
 
 
