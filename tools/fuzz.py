@@ -379,16 +379,15 @@ def fuzz(
     return outcome
 
 
-def table(outcomes: dict[str, Outcome]) -> str:
-    """Return the counts as a table in Markdown."""
-    lines = [
-        "| Reader | Inputs | Read | Errors of ours | Others | Hangs | Slowest (s) |",
-        "|---|--:|--:|--:|--:|--:|--:|",
-    ]
-    for name, one in outcomes.items():
-        counts = (one.inputs, one.read, one.refused, one.others.total(), one.hangs, f"{one.slowest:.1f}")
-        lines.append(f"| {name} | {' | '.join(map(str, counts))} |")
-    return "\n".join(lines) + "\n"
+HEAD = """| Reader | Inputs | Read | Errors of ours | Others | Hangs | Slowest (s) |
+|---|--:|--:|--:|--:|--:|--:|
+"""
+
+
+def row(name: str, one: Outcome) -> str:
+    """Return the counts of a reader as a row of a table in Markdown, below `HEAD`."""
+    counts = (one.inputs, one.read, one.refused, one.others.total(), one.hangs, f"{one.slowest:.1f}")
+    return f"| {name} | {' | '.join(map(str, counts))} |\n"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -407,6 +406,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         with tempfile.TemporaryDirectory() as folder:
             seeds = write_seeds(Path(folder))
+            say(HEAD)
             for reader in said.readers:
                 rng = random.Random(f"{said.seed} {reader}")
                 outcomes[reader] = fuzz(
@@ -418,12 +418,12 @@ def main(arguments: list[str] | None = None) -> int:
                     seconds=said.seconds,
                     found=said.found,
                 )
+                say(row(reader, outcomes[reader]))
                 for fault, times in outcomes[reader].others.most_common():
-                    say(f"{reader}: {fault} ({times})\n")
+                    sys.stderr.write(f"{reader}: {fault} ({times})\n")
                 sys.stdout.flush()
     finally:
         worker.stop()
-    say(table(outcomes))
     return int(any(one.others or one.hangs for one in outcomes.values()))
 
 

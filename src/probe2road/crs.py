@@ -7,7 +7,7 @@ that a metre is a metre to within a part per thousand wherever the fleet drives.
 from __future__ import annotations
 
 import logging
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,9 +19,11 @@ from probe2road.errors import CRSError
 
 __all__ = [
     "WGS84",
+    "Placed",
     "crs_title",
     "crs_to_text",
     "extent_in_degrees",
+    "extents_apart",
     "is_true_to_scale",
     "local_crs",
     "parse_crs",
@@ -42,6 +44,7 @@ _UTM_ZONE_OVERHANG = 0.5  # degrees a data set may reach into the next zone and 
 _SCALE_TOLERANCE = 2e-3  # of a projection that may stay the CRS of a run
 _WANTED_TOLERANCE = 1e-2  # of one that the user names: a neighbouring UTM zone is fine
 _NORTH_DEGREES, _NORTH_METRES = 1e-4, 10.0  # how far north a place is looked at to find where north is
+_NEAR = 1000.0  # m between two data sets that may have to do with each other
 _UTM_LATITUDES = (-80.0, 84.0)  # degrees; outside, UTM is not defined
 
 
@@ -300,6 +303,42 @@ def extent_in_degrees(bounds: tuple[float, float, float, float], crs: CRS) -> st
     left, bottom, right, top = bounds
     lon, lat = transform(np.array([left, right, left, right]), np.array([bottom, bottom, top, top]), crs, WGS84)
     return f"{min(lon):.4f}..{max(lon):.4f} E, {min(lat):.4f}..{max(lat):.4f} N"
+
+
+class Placed(Protocol):
+    """What lies somewhere: a fleet, or a road graph."""
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Left, bottom, right, top; NaN where there is nothing."""
+
+    @property
+    def crs(self) -> CRS:
+        """The CRS of the bounds."""
+
+
+def extents_apart(first: Placed, second: Placed) -> tuple[str, str] | None:
+    """Say in degrees where two data sets lie that have nothing in common; None where they meet, or one is empty.
+
+    Data sets meet where no more than a kilometre lies between their boxes.
+
+    Examples
+    --------
+    >>> from probe2road.graph.roadgraph import graph_from_lines
+    >>> here, near, away = (graph_from_lines([[(x, 4e6), (x + 9, 4e6)]], crs="EPSG:32616") for x in (0, 99, 5e5))
+    >>> extents_apart(here, near)
+    >>> extents_apart(here, away)
+    ('-92.5357..-92.5356 E, 36.0417..36.0417 N', '-87.0000..-86.9999 E, 36.1447..36.1447 N')
+    """
+    if not np.isfinite([first.bounds, second.bounds]).all():
+        return None
+    left, bottom, right, top = second.bounds
+    x, y = transform(np.array([left, left, right, right]), np.array([bottom, top, bottom, top]), second.crs, first.crs)
+    west, south, east, north = first.bounds
+    aside = np.max([west - x.max(), x.min() - east, south - y.max(), y.min() - north])
+    if aside <= _NEAR:  # corners that cannot be projected are far away
+        return None
+    return extent_in_degrees(first.bounds, first.crs), extent_in_degrees(second.bounds, second.crs)
 
 
 def turn_headings(heading: ArrayLike, x: ArrayLike, y: ArrayLike, source: CRS, target: CRS) -> NDArray[np.float64]:

@@ -125,3 +125,52 @@ def test_a_file_in_the_place_of_a_folder_is_refused(call: Call, words: tuple[str
     code, said = call(*words, "-o", "drives.csv")
     assert code == 2
     assert "is a file, and a folder would be written" in " ".join(said.split())
+
+
+def write_roads(path: Path, north: float) -> None:
+    lines = [shapely.LineString([(446000, north), (446200, north)])]
+    gpd.GeoDataFrame(geometry=lines, crs="EPSG:32616").to_file(path)
+
+
+def test_matches_with_a_graph_somewhere_else_are_written_and_warned_of(folder: Path, call: Call) -> None:
+    write_roads(folder / "away.gpkg", 5636000)
+    code, said = call("match", "drives.csv", "away.gpkg", *READ, "-o", "matches.csv")
+    assert code == 3
+    assert "no fix of 60 is matched" in said
+    assert pd.read_csv(folder / "matches.csv")["edge"].isna().all()
+
+
+@pytest.mark.parametrize(
+    ("north", "reason"),
+    [(5636000, "the proposal is at -87.65"), (4636050, "no metric finds a road that both have")],
+)
+def test_scores_of_graphs_with_nothing_in_common_are_warned_of(
+    folder: Path, call: Call, north: float, reason: str
+) -> None:
+    write_roads(folder / "street.gpkg", 4636000)
+    write_roads(folder / "other.gpkg", north)
+    code, said = call("evaluate", "street.gpkg", "other.gpkg", "--metrics", "geo", "-o", "scores.csv")
+    assert code == 3
+    assert reason in " ".join(said.split())
+    assert pd.read_csv(folder / "scores.csv")["f1"].tolist() == [0.0]
+    assert call("evaluate", "street.gpkg", "street.gpkg", "--metrics", "geo") == (0, "")
+
+
+def test_a_build_without_a_road_is_written_and_warned_of(folder: Path, call: Call) -> None:
+    code, said = call(
+        *("build", "drives.csv", *READ, "--segmenter", "density", "--min-drives", "9", "-o", "roads.geojson")
+    )
+    assert code == 3
+    assert said
+    assert len(read_graph(folder / "roads.geojson").edges) == 0
+
+
+def test_a_view_of_traces_and_a_reference_somewhere_else_is_warned_of(folder: Path, call: Call) -> None:
+    write_roads(folder / "away.gpkg", 4836000)
+    code, said = call(
+        "view", "away.gpkg", "--traces", "drives.csv", *READ, "--reference", "streets.gpkg", "-o", "v.png"
+    )
+    said = " ".join(said.split())
+    assert code == 0
+    assert "but the traces are at -87.65" in said
+    assert "but the reference is at -87.65" in said

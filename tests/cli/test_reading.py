@@ -26,11 +26,12 @@ FLEET = {
     "--invalid",
     "--max-accuracy",
     "--max-speed",
+    "--max-uncompressed",
     "--time-format",
     "--interval",
 }
-GRAPH = {"--layer", "--graph-crs"}
-REFERENCE = {"--reference-layer", "--reference-crs"}
+GRAPH = {"--layer", "--graph-crs", "--max-uncompressed"}
+REFERENCE = {"--reference-layer", "--reference-crs", "--max-uncompressed"}
 
 
 @pytest.mark.parametrize(

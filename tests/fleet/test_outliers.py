@@ -11,7 +11,8 @@ from pyproj import CRS
 
 from probe2road.errors import InputError
 from probe2road.fleet.contract import fleet_from_tables, stray_fixes
-from probe2road.fleet.outliers import OutlierOptions, impossible_fixes
+from probe2road.fleet.outliers import OutlierOptions, impossible_fixes, main_area
+from probe2road.io.describe import describe_fleet
 
 DEGREES, METRES = CRS.from_epsg(4326), "EPSG:32633"
 
@@ -90,3 +91,43 @@ def test_two_vehicles_under_one_id_are_no_strays() -> None:
     table = pd.DataFrame({"trace_id": 1, "t": np.arange(20), "x": 400000.0 + 10 * np.arange(20), "y": 5800000.0})
     table.loc[::2, "y"] += 900.0
     assert not stray_fixes(fleet_from_tables(table, crs=METRES)).any()
+
+
+def test_a_trace_of_its_own_far_away_does_not_choose_the_crs(caplog: pytest.LogCaptureFixture) -> None:
+    drives = [drive(trace=f"d{number}") for number in range(5)]
+    stray = drive(lon=2.35, trace="paris")
+    with caplog.at_level(logging.WARNING):
+        fleet = fleet_from_tables(pd.concat([*drives, stray]), crs=DEGREES)
+    assert fleet.crs.to_epsg() == 32633
+    assert fleet.n_traces == 6
+    assert "20 of 120 fixes, far away from the others, do not decide the local CRS" in caplog.text
+
+
+def test_fixes_that_are_kept_do_not_choose_the_crs() -> None:
+    table = drive()
+    table.loc[3, "x"] = -150.0
+    fleet = fleet_from_tables(table, crs=DEGREES, outliers=OutlierOptions(drop=False))
+    assert fleet.crs.to_epsg() == 32633
+    assert len(fleet.traces) == 20
+
+
+def test_cities_of_one_size_choose_the_crs_together() -> None:
+    table = pd.DataFrame({"x": np.repeat([0.0, 500e3, 900e3], 5), "y": 6e6})
+    assert main_area(table, CRS.from_user_input(METRES)).all()
+
+
+@pytest.mark.parametrize("clock", [True, False])
+def test_a_stray_fix_does_not_refuse_a_table_in_metres(clock: bool) -> None:
+    table = pd.DataFrame({"trace_id": 1, "t": range(20), "x": 500e3 + 10.0 * np.arange(20), "y": 5.8e6})
+    table.loc[7, "x"] = 9e8
+    fleet = fleet_from_tables(table if clock else table.drop(columns="t"), crs=METRES)
+    assert len(fleet.traces) == 19
+
+
+def test_figures_are_those_without_fixes_that_jump_aside(caplog: pytest.LogCaptureFixture) -> None:
+    table = pd.DataFrame({"trace_id": 1, "t": range(20), "x": 500e3 + 10.0 * np.arange(20), "y": 5.8e6})
+    table.loc[7, "y"] += 400.0
+    with caplog.at_level(logging.WARNING):
+        figures = describe_fleet(fleet_from_tables(table, crs=METRES))
+    assert (figures["fixes"], figures["length_km"]) == (19, 0.19)
+    assert "left out 1 of 20 fixes that jump aside and back" in caplog.text

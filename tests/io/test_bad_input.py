@@ -52,6 +52,7 @@ def refusal(*source: Path, crs: str | None = UTM, **options: object) -> str:
         ("a.csv", GOOD.encode("utf-16"), "the text is UTF-16; save it as UTF-8"),
         ("a.csv", b"trip,t,x,y\xff\n1,0,1,1\n", "the first line is not UTF-8"),
         ("a.csv", GOOD.encode() + b"1,2,44\xdf,4636000\n", "column x is not UTF-8"),
+        ("a.csv", GOOD.encode() + b"1,2,44\xdf\n", "the text is not UTF-8"),
         ("a.csv", GOOD.encode() + b"Stra\xdfe,2,446018,4636000\n", "not a readable text table"),
         ("a.csv", b"\x00\x01\x02PAR1" * 50, "the file is binary, not text"),
         ("a.csv", b"trip,x,x,y\n1,1,1,1\n", "several columns are called x"),

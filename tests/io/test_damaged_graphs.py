@@ -8,13 +8,14 @@ import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
+import geopandas as gpd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pyogrio
 import pytest
 import shapely
 
-from probe2road.errors import Probe2RoadError
+from probe2road.errors import InputError, Probe2RoadError
 from probe2road.graph.roadgraph import graph_from_lines
 from probe2road.io.describe import describe_file
 from probe2road.io.graph_files import read_graph, write_graph
@@ -157,3 +158,19 @@ def test_osm_with_a_node_that_is_nowhere(tmp_path: Path, tag: str) -> None:
     way = '<way id="-1"><nd ref="-1"/><nd ref="-2"/><tag k="highway" v="road"/></way>'
     path.write_text(f'<osm version="0.6"><node id="-1" lat="48" lon="9"/><node id="-2" lon="9" {tag}/>{way}</osm>')
     refusal(path)
+
+
+def test_an_answer_of_overpass_beyond_the_earth_is_refused(tmp_path: Path) -> None:
+    way = '{"type": "way", "id": 7, "nodes": [1, 2], "tags": {"highway": "service"}}'
+    nodes = [f'{{"type": "node", "id": {n}, "lat": 48.0, "lon": {lon}}}' for n, lon in ((1, "9.0"), (2, "1e308"))]
+    path = tmp_path / "roads.json"
+    path.write_text(f'{{"osm3s": {{}}, "elements": [{", ".join([*nodes, way])}]}}')
+    with pytest.raises(InputError, match=r"1e\+308, 48 is no longitude and latitude"):
+        read_graph(path)
+
+
+def test_an_empty_line_among_others_is_passed_over(tmp_path: Path) -> None:
+    lines = [shapely.LineString(), shapely.LineString([(446000, 4636000), (446100, 4636000)])]
+    path = tmp_path / "roads.fgb"
+    gpd.GeoDataFrame(geometry=lines, crs="EPSG:32616").to_file(path, SPATIAL_INDEX="NO")
+    assert len(read_graph(path).edges) == 1

@@ -14,6 +14,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from probe2road.benchmark.sets.recording import Recording, record_fleet
+from probe2road.draw.view import view
 from probe2road.errors import OutputError
 from probe2road.fleet.contract import fleet_from_tables
 from probe2road.graph.roadgraph import RoadGraph
@@ -23,6 +25,7 @@ from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.io.table_writer import write_table
 from probe2road.run.stages import ROADS, WINDOW
 from probe2road.run.workspace import open_workspace
+from probe2road.simulation.networks.network import network_from_sections
 from sketches import graph_of
 
 OLD = graph_of([(0, 0), (100, 0)])
@@ -143,6 +146,39 @@ def test_a_workspace_goes_on_after_any_failure(tmp_path: Path, monkeypatch: pyte
             assert state(found) == state(NEW)
     assert number > 5
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_recording_goes_on_after_any_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    network = network_from_sections([[(0, 0), (500, 0)]], crs="EPSG:32616")
+
+    def record(folder: Path) -> Recording:
+        return record_fleet(network, folder, n_drives=1, seed=3)
+
+    whole = record(tmp_path / "whole")
+    for number in itertools.count():
+        with failing(number, errno.ENOSPC, monkeypatch):
+            try:
+                recording = record(tmp_path / "fails")
+            except OutputError as error:
+                assert "no space left" in str(error)  # noqa: PT017
+            else:
+                break
+    assert number > 5
+    names = [path.name for path in whole.files]
+    assert sorted(path.name for path in recording.folder.iterdir()) == names
+    for name in names:
+        if not name.endswith(".gpkg"):
+            assert (recording.folder / name).read_bytes() == (whole.folder / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("name", ["roads.html", "roads.png"])
+def test_a_view_is_old_or_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    path = tmp_path / name
+    view(OLD, path)
+    before = path.read_bytes()
+    assert_all_or_nothing(
+        tmp_path, lambda _: view(NEW, path), lambda _: path.read_bytes() == before, monkeypatch, errno.EIO
+    )
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from probe2road.baselines.volume import count_voxels, dense_pillars
 from probe2road.baselines.volume_graph import graph_from_volume
 from probe2road.baselines.volume_skeleton import thin_volume
 from probe2road.bounds import NotNegative, Positive
-from probe2road.fleet.contract import Fleet, TraceGaps
+from probe2road.fleet.contract import Fleet, TraceGaps, without_strays
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.options import checked
@@ -94,6 +94,7 @@ def build_kde(
     True
     """
     options, report = options or KdeOptions(), progress or silent
+    fleet = without_strays(fleet, options.gaps)
     grid = fleet_grid(fleet, resolution=options.resolution)
     with open_workspace(workspace, fleet, options) as work:
         if (kept := work.read_graph(ROADS)) is not None:

@@ -267,6 +267,8 @@ def evaluate(
     if output:
         write_table(scores, output)
     _print_scores(scores)
+    if not scores[["precision", "recall"]].any(axis=None):
+        raise typer.Exit(_NOTHING)
 
 
 @app.command()

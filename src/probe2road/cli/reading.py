@@ -57,6 +57,7 @@ FLAGS: Mapping[str, str] = {
     "invalid": "--invalid",
     "max_accuracy": "--max-accuracy",
     "max_speed": "--max-speed",
+    "max_uncompressed": "--max-uncompressed",
     "layer": "--layer",
     "inner_junctions": "--no-inner-junctions",
     "segmenter": "--segmenter",
@@ -147,6 +148,10 @@ def fleet_options(
         float | None,
         typer.Option(help="Leave out fixes faster than this from their neighbours, m/s.", rich_help_panel=_FLEET),
     ] = None,
+    max_uncompressed: Annotated[
+        float | None,
+        typer.Option(help="Gigabytes that a compressed file may hold; 4 without it.", rich_help_panel=_FLEET),
+    ] = None,
 ) -> Said[FleetFormat]:
     """Return what is said of the files of a fleet; verbs that take a graph, too, call the layer ``--traces-layer``."""
     from probe2road.io.formats import FleetFormat
@@ -166,6 +171,7 @@ def fleet_options(
         "invalid": invalid,
         "max_accuracy": max_accuracy,
         "max_speed": max_speed,
+        "max_uncompressed": max_uncompressed,
     }
     return Said(FleetFormat, "format", fields, FLAGS)
 
@@ -186,12 +192,22 @@ def graph_options(
             rich_help_panel=_GRAPH,
         ),
     ] = False,
+    max_uncompressed: Annotated[
+        float | None,
+        typer.Option(help="Gigabytes that a compressed file may hold; 4 without it.", rich_help_panel=_GRAPH),
+    ] = None,
 ) -> Said[GraphFormat]:
     """Return the description of the file of a graph."""
     from probe2road.io.formats import GraphFormat
 
-    flags = {"layer": "--layer", "crs": "--graph-crs", "inner_junctions": "--no-inner-junctions"}
-    fields = {"layer": graph_layer, "crs": graph_crs, "inner_junctions": False if no_inner_junctions else None}
+    flags = {
+        "layer": "--layer",
+        "crs": "--graph-crs",
+        "inner_junctions": "--no-inner-junctions",
+        "max_uncompressed": "--max-uncompressed",
+    }
+    inner = False if no_inner_junctions else None
+    fields = {"layer": graph_layer, "crs": graph_crs, "inner_junctions": inner, "max_uncompressed": max_uncompressed}
     return Said(GraphFormat, "graph_format", fields, flags)
 
 
@@ -211,6 +227,10 @@ def reference_options(
             rich_help_panel=_REFERENCE,
         ),
     ] = False,
+    max_uncompressed: Annotated[
+        float | None,
+        typer.Option(help="Gigabytes that a compressed file may hold; 4 without it.", rich_help_panel=_REFERENCE),
+    ] = None,
 ) -> Said[GraphFormat]:
     """Return the description of the file of a reference graph."""
     from probe2road.io.formats import GraphFormat
@@ -219,9 +239,15 @@ def reference_options(
         "layer": "--reference-layer",
         "crs": "--reference-crs",
         "inner_junctions": "--no-reference-inner-junctions",
+        "max_uncompressed": "--max-uncompressed",
     }
     inner = False if no_reference_inner_junctions else None
-    fields = {"layer": reference_layer, "crs": reference_crs, "inner_junctions": inner}
+    fields = {
+        "layer": reference_layer,
+        "crs": reference_crs,
+        "inner_junctions": inner,
+        "max_uncompressed": max_uncompressed,
+    }
     return Said(GraphFormat, "reference_format", fields, flags)
 
 
@@ -229,6 +255,8 @@ def takes(
     *, without: Collection[str] = (), **groups: Callable[..., Said[Any]]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command options in groups: typer sees all options, the command gets one object for each group.
+
+    An option that several groups declare is one option, which is said to all of them.
 
     Parameters
     ----------
@@ -243,7 +271,7 @@ def takes(
     ... def show(path: str, graph: Said) -> None:
     ...     print(path, graph.fields["layer"])
     >>> list(signature(show).parameters)
-    ['path', 'graph_layer', 'no_inner_junctions']
+    ['path', 'graph_layer', 'no_inner_junctions', 'max_uncompressed']
     >>> show(path="roads.gpkg", graph_layer="streets")
     roads.gpkg streets
     """
@@ -255,15 +283,18 @@ def takes(
             if parameter.name in groups:
                 group = [option for option in _parameters(groups[parameter.name]) if option.name not in without]
                 options[parameter.name] = [option.name for option in group]
-                shown += group
+                shown += [option for option in group if option.name not in {other.name for other in shown}]
             else:
                 shown.append(parameter)
 
         @wraps(verb)
         def run(**words: Any) -> None:
-            for name, names in options.items():
-                words[name] = groups[name](**{option: words.pop(option) for option in names if option in words})
-            verb(**words)
+            said = {
+                name: groups[name](**{option: words[option] for option in names if option in words})
+                for name, names in options.items()
+            }
+            ours = {option for names in options.values() for option in names}
+            verb(**{name: value for name, value in words.items() if name not in ours}, **said)
 
         run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
         run.__signature__ = Signature(shown)  # type: ignore[attr-defined]  # where inspect.signature looks first

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
+from probe2road.crs import extents_apart
 from probe2road.draw.page import page_text, write_page
 from probe2road.draw.picture import draw_graph
 from probe2road.errors import OptionError
@@ -140,6 +141,9 @@ def view(
     """
     require_drawable(path)
     graph = withhold(graph, min_drives=min_drives)
+    for name, other in (("traces are", fleet), ("reference is", reference)):
+        if other is not None and (places := extents_apart(graph, other)):
+            logger.warning("the graph is at %s, but the %s at %s", places[0], name, places[1])
     if Path(path).suffix.lower() in _PICTURES:
         if color_by is not None:
             raise OptionError("a picture is coloured by origin only", where=path, fix="use .html")

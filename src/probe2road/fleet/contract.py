@@ -16,7 +16,12 @@ from pyproj import CRS
 from probe2road.bounds import NotNegative, Positive
 from probe2road.crs import WGS84, is_true_to_scale, local_crs, parse_crs, require_metric, transform, turn_headings
 from probe2road.errors import CRSError, InputError, OptionError
-from probe2road.fleet.outliers import OutlierOptions, without_impossible_fixes, without_impossible_points
+from probe2road.fleet.outliers import (
+    OutlierOptions,
+    main_area,
+    without_impossible_fixes,
+    without_impossible_points,
+)
 from probe2road.fleet.tables import (
     POINT_KINDS,
     check_points,
@@ -254,10 +259,14 @@ def stray_fixes(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool_
     return stray
 
 
-def without_strays(fleet: Fleet, gaps: TraceGaps | None = None) -> Fleet:
-    """Return the fleet without its `stray_fixes`; the same fleet where there are none."""
+def without_strays(fleet: Fleet, gaps: TraceGaps | None = None, *, silent: bool = False) -> Fleet:
+    """Return the fleet without its `stray_fixes`, with a warning; the same fleet where there are none."""
     stray = stray_fixes(fleet, gaps)
-    return replace(fleet, traces=fleet.traces[~stray].reset_index(drop=True)) if stray.any() else fleet
+    if not stray.any():
+        return fleet
+    if not silent:
+        logger.warning("left out %d of %d fixes that jump aside and back", int(stray.sum()), len(stray))
+    return replace(fleet, traces=fleet.traces[~stray].reset_index(drop=True))
 
 
 def _strays_of_trace(
@@ -406,7 +415,11 @@ def _metric_target(traces: pd.DataFrame, source: CRS, target_crs: Any, where: ob
     """Return the CRS to work in: the given one, the data's own if it is metric and true to scale, or a local one."""
     if target_crs is not None:
         return require_metric(parse_crs(target_crs, where=where), where=where)
-    x, y = traces["x"].to_numpy(), traces["y"].to_numpy()
+    deciding = main_area(traces, source)
+    if not deciding.all():
+        left = len(deciding) - int(deciding.sum())
+        logger.warning("%d of %d fixes, far away from the others, do not decide the local CRS", left, len(deciding))
+    x, y = traces["x"].to_numpy()[deciding], traces["y"].to_numpy()[deciding]
     extremes = np.array([x.argmin(), x.argmax(), y.argmin(), y.argmax()])
     lon, lat = transform(x[extremes], y[extremes], source, WGS84)
     crs = source if _is_metric(source) and is_true_to_scale(source, lon, lat) else local_crs(lon, lat)

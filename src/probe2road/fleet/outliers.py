@@ -19,18 +19,22 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from pyproj import CRS
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from probe2road.bounds import AtLeast, Positive
 from probe2road.errors import InputError
 from probe2road.fleet.tables import run_starts
 from probe2road.options import checked
 
-__all__ = ["OutlierOptions", "impossible_fixes", "without_impossible_fixes", "without_impossible_points"]
+__all__ = ["OutlierOptions", "impossible_fixes", "main_area", "without_impossible_fixes", "without_impossible_points"]
 
 logger = logging.getLogger(__name__)
 
 _EARTH = 6_371_000.0  # m, radius
 _METRES_PER_DEGREE = 111_000.0  # of latitude
+_PLACE = 100_000.0  # m, side of the squares that tell one area from another
+_SMALL = 0.2  # of the fixes of the largest area; an area with no more does not decide the CRS
 _NAMED = 5  # fixes in one warning
 
 
@@ -96,6 +100,43 @@ def impossible_fixes(traces: pd.DataFrame, crs: CRS, *, options: OutlierOptions 
             if _too_far(kept, crs, starts, ends, begins, options).all():
                 bad[rows[cuts[piece] : cuts[piece + 1]]] = True
     return bad
+
+
+def main_area(traces: pd.DataFrame, crs: CRS) -> NDArray[np.bool_]:
+    """Mark the fixes that may decide the CRS of a run: all but those of small areas far away from the others.
+
+    An area is what hangs together in squares of 100 km; it is small with a fifth of the fixes of the largest one, or
+    less. So neither a stray trace nor fixes that are kept, although no vehicle can have been there, decide how a fleet
+    is measured.
+
+    Parameters
+    ----------
+    traces
+        Checked traces, at least one fix.
+    crs
+        CRS of their coordinates.
+
+    Returns
+    -------
+    ndarray of bool, shape (n_fixes,)
+
+    Examples
+    --------
+    >>> table = pd.DataFrame({"x": [9.0, 9.1, 9.2, 9.3, 9.4, 2.0], "y": 48.0})
+    >>> main_area(table, CRS.from_epsg(4326)).tolist()
+    [True, True, True, True, True, False]
+    """
+    side = _PLACE / (_METRES_PER_DEGREE if crs.is_geographic else 1.0)
+    x, y = (np.floor(traces[axis].to_numpy() / side).astype(np.int64) for axis in "xy")
+    if np.ptp(x) <= 1 and np.ptp(y) <= 1:
+        return np.ones(len(traces), bool)
+    width = np.ptp(x) + 1
+    keys, place, count = np.unique((y - y.min()) * width + x - x.min(), return_inverse=True, return_counts=True)
+    places = np.column_stack([keys % width, keys // width])
+    near = cKDTree(places).sparse_distance_matrix(cKDTree(places), 1.5, output_type="coo_matrix")
+    areas, area = connected_components(near, directed=False)
+    size = np.bincount(area, count, minlength=areas)
+    return np.asarray((size > _SMALL * size.max())[area[place]])
 
 
 def without_impossible_fixes(

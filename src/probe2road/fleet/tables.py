@@ -494,10 +494,19 @@ def _metre_faults(x: NDArray[np.float64], y: NDArray[np.float64], crs: CRS) -> l
     spread = float(np.hypot(np.ptp(x), np.ptp(y)))
     if max(np.abs(x).max(), np.abs(y).max()) <= 180 and 0 < spread < _SPREAD_OF_DEGREES:
         return [f'the coordinates look like degrees ({extent}) but the CRS is {crs.name}; pass crs="EPSG:4326" if so']
+    most = _in_middle(x) & _in_middle(y)  # a stray fix says nothing about the CRS
+    if most.any():
+        x, y = x[most], y[most]
     if _in_area_of_use(x, y, crs):
         return []
     swapped = "; x and y look swapped" if _in_area_of_use(y, x, crs) else "; check the CRS"
     return [f"the coordinates ({extent}) are far from where {crs.name} is used{swapped}"]
+
+
+def _in_middle(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Mark all but the twentieth part at both ends."""
+    low, high = np.quantile(values, 0.05, method="higher"), np.quantile(values, 0.95, method="lower")
+    return np.asarray((low <= values) & (values <= high))
 
 
 def _in_area_of_use(x: NDArray[np.float64], y: NDArray[np.float64], crs: CRS) -> bool:

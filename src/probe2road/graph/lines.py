@@ -47,8 +47,7 @@ def one_line_each(lines: NDArray[np.object_], attributes: pd.DataFrame) -> tuple
     """
     if not len(lines):
         return lines, attributes
-    coordinates, owner = shapely.get_coordinates(lines, return_index=True)
-    whole = shapely.linestrings(np.round(coordinates / _SAME_PLACE), indices=owner)
+    whole = shapely.transform(lines, lambda places: np.round(places / _SAME_PLACE))  # without heights; may be empty
     drawn, back = shapely.to_wkb(whole), shapely.to_wkb(shapely.reverse(whole))
     number = pd.factorize(np.concatenate([drawn, back]))[0]
     drawn, back = number[: len(lines)], number[len(lines) :]

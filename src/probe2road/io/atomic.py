@@ -351,7 +351,7 @@ def _move(workshop: Path, target: Path) -> None:
     _make_durable(written)
     if not target.is_dir():
         written.replace(target)
-        _sync(target.parent)
+        _confirm(target)
         return
     # A folder that is not empty cannot be replaced in one step: set it aside, and back if the move fails.
     aside = workshop / f"{target.name}.old"
@@ -361,7 +361,17 @@ def _move(workshop: Path, target: Path) -> None:
     except OSError:
         aside.replace(target)
         raise
-    _sync(target.parent)
+    _confirm(target)
+
+
+def _confirm(target: Path) -> None:
+    """Have the new name on the disk; the file is in place whether that succeeds or not."""
+    try:
+        _sync(target.parent)
+    except OSError as error:
+        reason = _NO_ROOM.get(error.errno or 0, error.strerror)
+        fault = f"is complete and in place, but the disk does not confirm it ({reason})"
+        raise OutputError(fault, where=target, fix="check the disk, and write it again") from error
 
 
 def _make_durable(written: Path) -> None:

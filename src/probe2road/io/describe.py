@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from probe2road.crs import WGS84, transform
-from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
+from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks, without_strays
 from probe2road.fleet.tables import POINT_KINDS
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet
@@ -111,7 +111,7 @@ def describe_fleet(
     gaps: TraceGaps | None = None,
     **read_options: Any,
 ) -> dict[str, Any]:
-    """Describe traces and semantic points in figures.
+    """Describe traces and semantic points in figures; fixes that jump aside and back are left out, with a warning.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def describe_fleet(
     >>> figures["traces"], figures["step_median"], figures["gaps"], figures["length_km"]
     (1, 9.0, 1, 0.018)
     """
-    data = fleet if isinstance(fleet, Fleet) else read_fleet(fleet, **read_options)
+    data = without_strays(fleet if isinstance(fleet, Fleet) else read_fleet(fleet, **read_options), gaps)
     table = data.traces
     first = np.zeros(len(table), bool)
     first[data.starts[:-1]] = True

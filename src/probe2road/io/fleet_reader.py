@@ -21,10 +21,12 @@ from probe2road.fleet.tables import TableOrigin, check_points, check_traces
 from probe2road.fleet.trimming import trim_ends
 from probe2road.io.atomic import settled
 from probe2road.io.clocks import FIRST_YEAR, LAST_YEAR
+from probe2road.io.compressed import require_bounded
 from probe2road.io.delimited import read_text_table
 from probe2road.io.fleet_writer import points_path
 from probe2road.io.formats import BBox, ColumnMap, FleetFormat, adjusted
 from probe2road.io.gpx import read_gpx
+from probe2road.io.guard import raised_by_callbacks
 from probe2road.io.layers import read_layer
 from probe2road.io.nmea import read_nmea
 from probe2road.io.parquet import inside, read_parquet
@@ -76,6 +78,7 @@ def read_fleet(
     invalid: str | None = None,
     max_accuracy: float | None = None,
     max_speed: float | None = None,
+    max_uncompressed: float | None = None,
 ) -> Fleet:
     r"""Read traces, and semantic points where there are any, and check everything.
 
@@ -131,6 +134,8 @@ def read_fleet(
         Metres: fixes that say themselves that they are less accurate are left out.
     max_speed
         m/s: fixes that could not have been driven to and away from any slower are left out.
+    max_uncompressed
+        Gigabytes that a compressed file may hold, 4 by default; one that holds more is refused before it is read.
 
     Returns
     -------
@@ -173,6 +178,7 @@ def read_fleet(
         invalid=invalid,
         max_accuracy=max_accuracy,
         max_speed=max_speed,
+        max_uncompressed=max_uncompressed,
     )
     trace_table, trace_crs, told = _read_all(traces, format, points=False)
     point_table, point_crs = None, trace_crs
@@ -248,7 +254,9 @@ def _read_all(source: Source, format: FleetFormat, *, points: bool) -> tuple[pd.
     errors: list[InputError] = []
     for file in files:
         try:
-            raw = _read_one(file, format, points=points)
+            require_bounded(file.path, format.max_uncompressed)
+            with raised_by_callbacks(file.path):
+                raw = _read_one(file, format, points=points)
             crs = _crs_of(raw, file, format.stated_crs)
             table = _checked_table(raw, file, crs, format, points=points)
         except InputError as error:

@@ -61,6 +61,7 @@ class FleetFormat:
     invalid: str | None = None  # rows without position or readable time: drop or refuse; None: drop up to 5 % of a file
     max_accuracy: float | None = None  # m; fixes that say that they are less accurate are left out
     max_speed: float | None = None  # m/s; fixes that no slower vehicle could have come to and left are left out
+    max_uncompressed: float = 4.0  # GB that a compressed file may hold
 
     def __post_init__(self) -> None:
         """Refuse what is no box, no delimiter or no CRS."""
@@ -73,10 +74,8 @@ class FleetFormat:
         if self.invalid not in (None, "drop", "refuse"):
             raise OptionError(f"invalid is {self.invalid!r}", fix="use drop or refuse, or leave it out")
         for name in ("max_accuracy", "max_speed", "interval"):
-            try:
-                object.__setattr__(self, name, fitted(getattr(self, name), Positive[float] | None, name))
-            except MisfitError as misfit:
-                raise OptionError(misfit.what, fix=misfit.fix) from misfit
+            _fit(self, name, Positive[float] | None)
+        _fit(self, "max_uncompressed", Positive[float])
         if self.time_format is not None and "%" not in self.time_format:
             fix = "write it as strptime does, such as %d.%m.%Y %H:%M:%S"
             raise OptionError(f"time_format {self.time_format!r} names no part of a time", fix=fix)
@@ -100,15 +99,19 @@ class GraphFormat:
     ------
     CRSError
         If pyproj cannot read a CRS.
+    OptionError
+        If a limit is no positive number.
     """
 
     crs: CRS | str | int | None = None  # of the coordinates, where the file names none
     target_crs: CRS | str | int | None = None  # metric CRS to work in; else the recorded, the file's own or a local one
     layer: str | None = None  # of the edges, in a file of several
     inner_junctions: bool = True  # whether lines of a GIS file are cut at inner vertices on which another line ends
+    max_uncompressed: float = 4.0  # GB that a compressed file may hold
 
     def __post_init__(self) -> None:
-        """Refuse what is no CRS."""
+        """Refuse what is no CRS and no size."""
+        _fit(self, "max_uncompressed", Positive[float])
         _check_crs(self.crs, self.target_crs)
 
 
@@ -121,9 +124,23 @@ def adjusted(format: F, **given: Any) -> F:
     Examples
     --------
     >>> adjusted(GraphFormat(crs="EPSG:32616"), layer="streets", crs=None)
-    GraphFormat(crs='EPSG:32616', target_crs=None, layer='streets', inner_junctions=True)
+    GraphFormat(crs='EPSG:32616', target_crs=None, layer='streets', inner_junctions=True, max_uncompressed=4.0)
     """
     return replace(format, **{name: value for name, value in given.items() if value is not None})
+
+
+def _fit(format: FleetFormat | GraphFormat, name: str, kind: Any) -> None:
+    """Bring a field into the form of its kind.
+
+    Raises
+    ------
+    OptionError
+        If it has no such form.
+    """
+    try:
+        object.__setattr__(format, name, fitted(getattr(format, name), kind, name))
+    except MisfitError as misfit:
+        raise OptionError(misfit.what, fix=misfit.fix) from misfit
 
 
 def _checked_bbox(bbox: Sequence[float]) -> BBox:

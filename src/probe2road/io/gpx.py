@@ -1,7 +1,8 @@
 """Reading traces from GPX 1.0 and 1.1 as a stream: a file is never held in memory as a tree.
 
 Strategy: expat calls back at the elements of a track point; the texts of positions, heights and times are
-collected in lists and converted together at the end. Routes and waypoints are no drives and are passed over.
+collected in lists, which become arrays as soon as they are long: a point takes some forty bytes, not a kilobyte.
+Routes and waypoints are no drives and are passed over.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ __all__ = ["read_gpx"]
 
 logger = logging.getLogger(__name__)
 
+_BLOCK, _SAID = 1 << 20, 100  # bytes read at once, and blocks between two lines of the log
+_POINTS = 1 << 16  # points whose texts are held
+_TEXT = "string[pyarrow]"
 _ANONYMOUS = "openstreetmap.org"  # creator of files with the points of many, whose own files it names otherwise
 
 _VALUES = {"ele": "z", "time": "t", "speed": "speed", "course": "heading"}  # children of a track point, at any depth
@@ -52,18 +56,18 @@ def read_gpx(source: SourceFile, *, invalid: str | None = None) -> RawTable:
         If the XML is broken (with the line), the file is no GPX, it has no track points, or only anonymous ones of the
         OpenStreetMap server, which are no drive.
     """
-    lists = _parse(source)
-    if not lists["lon"]:
+    lists, blocks = _parse(source)
+    count = sum(map(len, blocks["lon"]))
+    if not count:
         fault = "no track points (routes and waypoints are not traces)"
         raise InputError(fault, where=source.path, fix="export the tracks")
     names = pd.array([f"{source.trace_name}/{track}/{segment}" for track, segment in lists["segment"]], dtype="str")
-    counts = np.diff([*lists["start"], len(lists["lon"])])
+    counts = np.diff([*lists["start"], count])
     table = {"trace_id": pd.Series(names.take(np.repeat(np.arange(len(counts)), counts)))}
-    table |= {"x": _numbers(lists["lon"]), "y": _numbers(lists["lat"])}
+    table |= {"x": _joined(blocks["lon"]), "y": _joined(blocks["lat"])}
     for tag, name in _VALUES.items():
-        values = lists[tag]
-        if values.count(None) < len(values):
-            table[name] = pd.Series(values, dtype=object) if tag == "time" else _numbers(values)
+        if not all(pd.isna(block).all() for block in blocks[tag]):
+            table[name] = _joined(blocks[tag])
     columns = {"x": "lon", "y": "lat", "z": "ele", "t": "time", "heading": "course"}
     return RawTable(
         _drives(pd.DataFrame(table), lists, source, invalid),
@@ -95,33 +99,56 @@ def _drives(table: pd.DataFrame, lists: dict[str, list[Any]], source: SourceFile
     return table[~untimed].reset_index(drop=True)
 
 
-def _parse(source: SourceFile) -> dict[str, list[Any]]:
-    """Return the texts of all track points, and the numbers and first points of their segments."""
+def _parse(source: SourceFile) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
+    """Return the numbers and first points of all segments, and the values of the track points in blocks."""
     lists: dict[str, list[Any]] = {name: [] for name in ("lon", "lat", *_VALUES, "segment", "start", "creator")}
+    blocks: dict[str, list[Any]] = {name: [] for name in ("lon", "lat", *_VALUES)}
     parser = expat.ParserCreate()
     parser.buffer_text = True
-    _connect(parser, lists, source)
+    _connect(parser, lists, blocks, source)
     try:
         with opened(source) as file:
-            parser.ParseFile(file)
+            number = 0
+            while block := file.read(_BLOCK):
+                parser.Parse(block, False)
+                number += 1
+                if number % _SAID == 0:
+                    logger.info("%s: read %d MB", source.path, number)
+            parser.Parse(b"", True)
     except expat.ExpatError as error:
         fault = f"broken XML at line {error.lineno}, column {error.offset + 1}: {expat.ErrorString(error.code)}"
         raise InputError(fault, where=source.path, fix="repair that line, or export the file again") from error
     except (OSError, EOFError, zlib.error) as error:
         fault = "broken gzip" if source.path.suffix.lower() == ".gz" else "the file cannot be read"
         raise InputError(f"{fault} ({error})", where=source.path, fix="copy it again") from error
-    return lists
+    _pack(lists, blocks)
+    return lists, blocks
 
 
-def _connect(parser: expat.XMLParserType, lists: dict[str, list[Any]], source: SourceFile) -> None:
-    """Let the parser fill the lists."""
+def _pack(lists: dict[str, list[Any]], blocks: dict[str, list[Any]]) -> None:
+    """Turn the texts in the lists into arrays, and empty the lists."""
+    for name, column in blocks.items():
+        texts = lists[name]
+        column.append(pd.array(texts, dtype=_TEXT) if name == "time" else _numbers(texts))
+        texts.clear()
+
+
+def _connect(
+    parser: expat.XMLParserType, lists: dict[str, list[Any]], blocks: dict[str, list[Any]], source: SourceFile
+) -> None:
+    """Let the parser fill the lists, and pack what they hold before they are long."""
     lon, lat, values = lists["lon"], lists["lat"], [lists[tag] for tag in _VALUES]
     text: list[str] = []
     state = {"track": -1, "segment": -1, "point": False, "root": False}
+    packed = 0
 
     def start(name: str, attributes: dict[str, str]) -> None:
+        nonlocal packed
         tag = name.rpartition(":")[2]
         if tag == "trkpt":
+            if len(lon) == _POINTS:
+                packed += _POINTS
+                _pack(lists, blocks)
             state["point"] = True
             lon.append(attributes.get("lon"))
             lat.append(attributes.get("lat"))
@@ -133,7 +160,7 @@ def _connect(parser: expat.XMLParserType, lists: dict[str, list[Any]], source: S
         elif tag == "trkseg":
             state["segment"] += 1
             lists["segment"].append((state["track"], state["segment"]))
-            lists["start"].append(len(lon))
+            lists["start"].append(packed + len(lon))
         elif tag == "trk":
             state["track"] += 1
             state["segment"] = -1
@@ -154,6 +181,11 @@ def _connect(parser: expat.XMLParserType, lists: dict[str, list[Any]], source: S
 
     parser.StartElementHandler = start
     parser.EndElementHandler = end
+
+
+def _joined(blocks: list[Any]) -> pd.Series:
+    """Return one column; of texts where a block holds any."""
+    return pd.concat([pd.Series(block) for block in blocks], ignore_index=True)
 
 
 def _numbers(texts: list[str | None]) -> Any:

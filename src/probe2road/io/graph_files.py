@@ -14,6 +14,7 @@ from probe2road.errors import InputError, MissingFileError, OptionError, OutputE
 from probe2road.graph.check import require_sound
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import settled
+from probe2road.io.compressed import require_bounded
 from probe2road.io.formats import GraphFormat, adjusted
 from probe2road.io.graph_networkx import read_graphml, write_graphml
 from probe2road.io.graph_readers import read_parquet_graph, read_vector_graph
@@ -77,6 +78,7 @@ def read_graph(
     target_crs: Any = None,
     layer: str | None = None,
     inner_junctions: bool | None = None,
+    max_uncompressed: float | None = None,
 ) -> RoadGraph:
     """Read a road graph from a file, in the format that its suffix names.
 
@@ -99,6 +101,8 @@ def read_graph(
         Layer of the edges, in a file of several.
     inner_junctions
         Whether lines of a GIS file are cut at inner vertices on which another line ends; True by default.
+    max_uncompressed
+        Gigabytes that a compressed file may hold, 4 by default; one that holds more is refused before it is read.
 
     Raises
     ------
@@ -112,7 +116,12 @@ def read_graph(
         If the suffix is of no format we read.
     """
     format = adjusted(
-        format or GraphFormat(), crs=crs, target_crs=target_crs, layer=layer, inner_junctions=inner_junctions
+        format or GraphFormat(),
+        crs=crs,
+        target_crs=target_crs,
+        layer=layer,
+        inner_junctions=inner_junctions,
+        max_uncompressed=max_uncompressed,
     )
     kind = graph_format(path, READABLE)
     file = settled(path)
@@ -120,6 +129,7 @@ def read_graph(
         raise MissingFileError("no such file", where=path, fix="check the path")
     if file.stat().st_size == 0:
         raise InputError("the file is empty", where=path, fix="check that it is complete")
+    require_bounded(file, format.max_uncompressed)
     with located(path):
         if kind == "OSM" or (kind == "GeoJSON" and holds_osm_json(path)):
             return read_osm(path, target_crs=format.target_crs)

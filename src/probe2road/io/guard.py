@@ -6,13 +6,15 @@ under `parsing`; what is made of its content is validated, so that a defect of o
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from probe2road.errors import InputError, Probe2RoadError
 
-__all__ = ["located", "parsing"]
+__all__ = ["located", "parsing", "raised_by_callbacks"]
 
 _LONGEST = 200  # characters of a foreign message that are of use
 
@@ -74,6 +76,38 @@ def located(where: object) -> Iterator[None]:
         if error.where is not None:
             raise
         raise type(error)(error.what, where=where, fix=error.fix) from error
+
+
+@contextmanager
+def raised_by_callbacks(where: object) -> Iterator[None]:
+    """Refuse a file of which compiled code shows a callback text that is not UTF-8.
+
+    Python would print that error, forget it, and let the block go on as if nothing had been.
+
+    Raises
+    ------
+    InputError
+        In the place of what the block raises, or at its end.
+    """
+    found: list[BaseException] = []
+    usual = sys.unraisablehook
+
+    def note(unraisable: Any) -> None:
+        if isinstance(unraisable.exc_value, UnicodeDecodeError):
+            found.append(unraisable.exc_value)
+        else:
+            usual(unraisable)
+
+    sys.unraisablehook = note
+    try:
+        yield
+    except Probe2RoadError:
+        if not found:
+            raise
+    finally:
+        sys.unraisablehook = usual
+    if found:
+        raise InputError(f"the text is not UTF-8 ({found[0]})", where=where, fix="save it as UTF-8")
 
 
 def _short(error: Exception) -> str:

@@ -81,4 +81,9 @@ def _elements(path: str | PathLike[str]) -> list[dict[str, Any]]:
 
 def _position(place: Any) -> tuple[float, float]:
     """Return ``(lon, lat)``, null for a position outside the requested box."""
-    return _NOWHERE if place is None or "lon" not in place else (float(place["lon"]), float(place["lat"]))
+    if place is None or "lon" not in place:
+        return _NOWHERE
+    lon, lat = float(place["lon"]), float(place["lat"])
+    if abs(lon) > 180 or abs(lat) > 90:
+        raise ValueError(f"{lon:g}, {lat:g} is no longitude and latitude")
+    return lon, lat

@@ -9,6 +9,7 @@ from typing import Any
 
 import pandas as pd
 
+from probe2road.crs import extents_apart
 from probe2road.errors import OptionError
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.metrics.apart import ApartOptions, apart_networks
@@ -19,7 +20,8 @@ from probe2road.metrics.graph_sampling import GraphSamplingOptions, graph_sampli
 from probe2road.metrics.itopo import ItopoOptions, itopo_networks
 from probe2road.metrics.junctions import JunctionOptions, junctions_networks
 from probe2road.metrics.lateral import LateralOptions, lateral_networks
-from probe2road.metrics.normalise import comparable_networks
+from probe2road.metrics.network import network_from_graph
+from probe2road.metrics.normalise import comparable
 from probe2road.metrics.scores import Score, scores_table
 from probe2road.metrics.topo import TopoOptions, topo_networks
 
@@ -81,7 +83,7 @@ def evaluate(
     ----------
     proposal, reference
         Road graphs in metric CRS; the proposal is reprojected to the CRS of the reference. Either may be empty and
-        then scores 0.
+        then scores 0. Where all scores are 0, a warning says why.
     metrics
         A name out of `METRICS`, or options of a metric where its defaults do not suit, or several of them: ``["geo",
         GeoOptions(radius=15)]`` scores twice.
@@ -113,14 +115,28 @@ def evaluate(
     """
     wanted = metrics if isinstance(metrics, Sequence) and not isinstance(metrics, str) else [metrics]
     options = [_resolve(metric) for metric in wanted]
-    first, second = comparable_networks(proposal, reference, area=area, merge=merge)
+    first, second = comparable(proposal, reference, area=area, merge=merge)
+    networks = network_from_graph(first), network_from_graph(second)
     scores: list[Score] = []
     for option in options:
         started = perf_counter()
-        result = _SCORERS[type(option)](first, second, option)
+        result = _SCORERS[type(option)](*networks, option)
         scores += result if isinstance(result, list) else [result]
         logger.info("%s, %.1f s", scores[-1], perf_counter() - started)
+    if not any(score.precision > 0 or score.recall > 0 for score in scores):
+        logger.warning("nothing of the proposal is in the reference: %s", _reason(first, second))
     return scores_table(scores)
+
+
+def _reason(proposal: RoadGraph, reference: RoadGraph) -> str:
+    """Say why two graphs have nothing in common."""
+    for name, graph in (("proposal", proposal), ("reference", reference)):
+        if graph.edges.empty:
+            return f"the {name} has no edges in the area"
+    places = extents_apart(proposal, reference)
+    if places is None:
+        return "they are near each other, but no metric finds a road that both have"
+    return f"the proposal is at {places[0]}, the reference at {places[1]}"
 
 
 def _resolve(metric: str | MetricOptions) -> MetricOptions:

@@ -28,6 +28,7 @@ __all__ = [
     "CHANNELS",
     "Grid",
     "count_pixels",
+    "dense_grid",
     "fleet_grid",
     "rasterize",
     "rasterize_windows",
@@ -44,6 +45,7 @@ _CACHED_WINDOW = 1024  # pixels; three channels of one row block stay in the pro
 _KEEP = np.uint32(0xFFFFFFFF)  # all bits: lines add to the value of a pixel
 
 _MOST_PIXELS = 20_000_000_000  # where the fleet drove; a byte each is all the memory of a large computer
+_MOST_DENSE = 2_000_000_000  # of an ordinary array of a whole area, which takes memory where nobody drove, too
 _LONGEST_SIDE = 2**31 - 1  # px, that a GeoTIFF can have
 _PLACE = 100.0  # m, side of the squares that show where the fleet drove
 
@@ -73,6 +75,35 @@ def fleet_grid(fleet: Fleet, *, resolution: float = 1.0, margin: float = 50.0) -
             where="fleet_grid",
             fix=f"use coarser pixels, for example resolution={resolution * 10:g}, or a smaller area",
         )
+    return grid
+
+
+def dense_grid(fleet: Fleet, *, resolution: float = 1.0) -> Grid:
+    """Return the `fleet_grid` of a method that holds its whole area in ordinary arrays.
+
+    Raises
+    ------
+    InputError
+        If the fleet has no fixes.
+    OptionError
+        If that would be more pixels than are worth it, most of which nobody drove on.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from probe2road.fleet.contract import fleet_from_tables
+    >>> table = pd.DataFrame({"trace_id": [1, 2], "x": [0.0, 300_000.0], "y": [0.0, 300_000.0]})
+    >>> dense_grid(fleet_from_tables(table, crs="EPSG:32616", keep_crs=True))
+    Traceback (most recent call last):
+        ...
+    probe2road.errors.OptionError: fleet_grid: the area is too wide for a method that holds all of its 90,060,610,201
+    pixels; use a smaller area, or resolution=10
+    """
+    grid = fleet_grid(fleet, resolution=resolution)
+    pixels = grid.rows * grid.cols
+    if pixels > _MOST_DENSE:
+        fault = f"the area is too wide for a method that holds all of its {pixels:,} pixels"
+        raise OptionError(fault, where="fleet_grid", fix=f"use a smaller area, or resolution={resolution * 10:g}")
     return grid
 
 

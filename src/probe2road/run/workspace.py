@@ -12,9 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import shutil
-import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -24,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import pandas as pd
-from filelock import FileLock, Timeout
+from filelock import FileLock
 from numpy.typing import NDArray
 
 from probe2road.errors import OutputError
@@ -36,6 +34,7 @@ from probe2road.io.graph_readers import read_note
 from probe2road.io.graph_writers import write_geopackage
 from probe2road.raster.blocks import Blocks
 from probe2road.raster.grid import Grid, read_blocks, read_tag, write_raster
+from probe2road.run.locks import holder, lock_folder
 from probe2road.run.stages import Stage, stage_of
 
 if TYPE_CHECKING:
@@ -205,12 +204,11 @@ def open_workspace(
         "run": _digest({**base, "options": asdict(options)}),
         "segmentation": _digest({**base, "options": asdict(segmentation or options)}),
         "options": asdict(options),
-        "process": os.getpid(),
-        "host": socket.gethostname(),
+        **holder(),
     }
     make_folder(folder)
     _require_ours(folder)
-    lock = _locked(folder)
+    lock = lock_folder(folder, _LOCK, mark=_MARK)
     sweep_leftovers(folder)
     for path in folder.iterdir():
         if _is_leftover(path) and not is_workshop(path):
@@ -250,21 +248,6 @@ def _read_mark(folder: Path) -> dict[str, Any] | None:
 def _is_leftover(path: Path) -> bool:
     """Tell whether a path is left over from a killed run: a hidden folder of ours, or one with nothing in it."""
     return path.name.startswith(".") and path.is_dir() and (is_workshop(path) or not any(path.iterdir()))
-
-
-def _locked(folder: Path) -> FileLock:
-    """Hold the folder for this process; the lock of one that died is free."""
-    lock = FileLock(folder / _LOCK)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        mark = _read_mark(folder) or {}
-        holder = f"process {mark['process']} on {mark['host']}" if "process" in mark else "another process"
-        fault = f"{holder} is working in this folder"
-        raise OutputError(fault, where=folder, fix="wait until it is done, or name another folder") from error
-    except OSError as error:
-        raise OutputError(f"cannot be locked ({error.strerror})", where=folder) from error
-    return lock
 
 
 @contextmanager

@@ -80,7 +80,7 @@ def lateral_spread(fleet: Fleet, grid: Grid, *, gaps: TraceGaps | None = None) -
     >>> round(lateral_spread(fleet, fleet_grid(fleet)), 2)
     0.61
     """
-    fleet = without_strays(fleet, gaps)
+    fleet = without_strays(fleet, gaps, silent=True)
     position, direction = _pieces(fleet, trace_breaks(fleet, gaps))
     cell_row, cell_col = (
         np.floor(np.abs(position[:, axis] - origin) / _CELL).astype(np.int64)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import pandas as pd
 import pytest
@@ -135,6 +136,20 @@ def test_another_run_replaces_a_recording(fork, recorded):
         *("drives.parquet", "poses.parquet", "reference.gpkg", "routes.parquet", "run.json"),
     ]
     assert read_fleet(other.drives).n_traces == 2
+
+
+def test_two_recordings_do_not_work_in_one_folder(fork, recorded, tmp_path):
+    refused = []
+
+    def second(*_):
+        with pytest.raises(OutputError, match=f"process {os.getpid()} on .* is working in this folder") as error:
+            record_fleet(fork, tmp_path / "busy", n_drives=2, seed=5)
+        refused.append(error)
+
+    again = record_fleet(fork, tmp_path / "busy", n_drives=8, seed=4, residual=ALIGNED, progress=second)
+    assert refused
+    assert contents(again) == contents(recorded)
+    assert sorted(again.folder.iterdir()) == again.files
 
 
 def test_other_roads_are_another_run(recorded, monkeypatch):

@@ -21,11 +21,11 @@ from probe2road.baselines.biagioni.pruning import prune_segments
 from probe2road.baselines.biagioni.street_map import initial_map, straight_pieces
 from probe2road.baselines.biagioni.traversals import Runs, TripPositions, good_runs, match_pieces, observe_trips
 from probe2road.bounds import NotNegative, OneOf, Positive
-from probe2road.fleet.contract import Fleet, TraceGaps
+from probe2road.fleet.contract import Fleet, TraceGaps, without_strays
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.models import PublishedModel
 from probe2road.options import checked
-from probe2road.raster.counts import fleet_grid
+from probe2road.raster.counts import dense_grid
 from probe2road.raster.grid import Grid
 from probe2road.run.progress import Progress, silent
 from probe2road.run.stages import COLLAPSED, PRUNED, ROADS, SKELETON, VECTORIZED
@@ -110,7 +110,8 @@ def build_biagioni(
     True
     """
     options, report = options or BiagioniOptions(), progress or silent
-    grid = fleet_grid(fleet, resolution=options.resolution)
+    fleet = without_strays(fleet, options.gaps)
+    grid = dense_grid(fleet, resolution=options.resolution)
     with open_workspace(workspace, fleet, options) as work:
         if (kept := work.read_graph(ROADS)) is not None:
             return kept

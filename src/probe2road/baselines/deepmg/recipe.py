@@ -20,10 +20,10 @@ from probe2road.baselines.deepmg.traversals import MatcherOptions, count_travers
 from probe2road.baselines.deepmg.variants import VARIANTS, find_variant
 from probe2road.bounds import OneOf, Probability
 from probe2road.errors import MissingFileError, OptionError
-from probe2road.fleet.contract import Fleet, TraceGaps
+from probe2road.fleet.contract import Fleet, TraceGaps, without_strays
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.options import checked
-from probe2road.raster.counts import fleet_grid
+from probe2road.raster.counts import dense_grid
 from probe2road.raster.grid import Grid
 from probe2road.run.progress import Progress, silent
 from probe2road.run.stages import LINKED, MASK, PROBABILITY, ROADS, VECTORIZED
@@ -99,6 +99,7 @@ def build_deepmg(
     Ruan et al., "Learning to Generate Maps from Trajectories", AAAI 2020; METHOD 3.
     """
     options, report = options or DeepMGOptions(), progress or silent
+    fleet = without_strays(fleet, options.gaps)
     with open_workspace(workspace, fleet, _Run(options, _digest(options.weights))) as work:
         if (kept := work.read_graph(ROADS)) is not None:
             return kept
@@ -135,7 +136,7 @@ def _segment(
         fault = f"the weights are of the variant {trained.variant.name}, not {options.variant}"
         raise OptionError(fault, where=options.weights, fix="name the variant that they were trained for")
     steps = thin_traces(fleet, trained.features, gaps=options.gaps)
-    grid = fleet_grid(fleet, resolution=trained.features.resolution)
+    grid = dense_grid(fleet, resolution=trained.features.resolution)
     if (kept := work.read_raster(PROBABILITY, grid)) is not None:
         return kept[:, :], grid, steps
     probability = np.zeros(grid.shape, np.float32)

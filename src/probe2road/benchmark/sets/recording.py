@@ -29,6 +29,7 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.atomic import atomic_path, make_folder, sweep_leftovers
 from probe2road.io.fleet_writer import ROW_GROUP, bounding_box, point_table, with_geo
 from probe2road.io.graph_files import write_graph
+from probe2road.run.locks import holder, locked
 from probe2road.run.progress import Progress
 from probe2road.simulation.fleet_simulation import FleetChunk, simulate_chunks
 from probe2road.simulation.networks.network import RoadNetwork
@@ -45,7 +46,7 @@ RUN_FILE = "run.json"
 POSES = ("aligned", "modelled", "raw")
 
 _FORMAT = 2  # raised when what a recording holds changes
-_PORTIONS = ".portions"
+_PORTIONS, _LOCK = ".portions", ".lock"
 _DRIVES = 20  # drives in a portion: some 300 km, 600,000 points
 # Table of a portion to the file that the tables of all portions become.
 _FILES = {
@@ -153,7 +154,8 @@ def record_fleet(
         If the amount is missing, given twice or not positive, the preset is unknown, or a fleet without camera is
         to be aligned.
     OutputError
-        If the folder has files in it that are not those of a recording, or cannot be created.
+        If the folder has files in it that are not those of a recording, if another process works in it, or if it cannot
+        be created.
 
     Examples
     --------
@@ -183,13 +185,15 @@ def record_fleet(
         "versions": {name: version(name) for name in ("probe2road", "numpy")},
     }
     recording = Recording(Path(folder))
-    portions = _open(recording.folder, json.loads(json.dumps(run)))
-    if portions is None:
-        logger.info("taking %s from an earlier run", recording.folder)
-        return recording
-    amount = {"n_drives": n_drives, "drive_km": drive_km}
-    _simulate_portions(network, chosen, portions, amount, seed, workers, residual, progress)
-    counts = _join(network, portions, recording, run)
+    make_folder(recording.folder)
+    with locked(recording.folder, _LOCK, mark=f"{_PORTIONS}/{RUN_FILE}"):
+        portions = _open(recording.folder, json.loads(json.dumps(run)))
+        if portions is None:
+            logger.info("taking %s from an earlier run", recording.folder)
+            return recording
+        amount = {"n_drives": n_drives, "drive_km": drive_km}
+        _simulate_portions(network, chosen, portions, amount, seed, workers, residual, progress)
+        counts = _join(network, portions, recording, run)
     logger.info(
         "recorded %d drives, %.0f km: %d poses, %d points in %s",
         counts["drives"], counts["km"], counts["traces"], counts["points"], recording.folder,
@@ -199,7 +203,6 @@ def record_fleet(
 
 def _open(folder: Path, run: Mapping[str, Any]) -> Path | None:
     """Prepare the folder: where the portions go, or None if this very recording is there already."""
-    make_folder(folder)
     done, portions = folder / RUN_FILE, folder / _PORTIONS
     mark = portions / RUN_FILE
     sweep_leftovers(folder)
@@ -212,13 +215,13 @@ def _open(folder: Path, run: Mapping[str, Any]) -> Path | None:
             shutil.rmtree(portions, ignore_errors=True)
             return None
         done.unlink()  # what lies beside it is no longer complete
-    elif not mark.exists() and any(folder.iterdir()):
+    elif not mark.exists() and any(path.name != _LOCK for path in folder.iterdir()):
         raise OutputError("the folder is not empty and not a recording", where=folder, fix="name an empty folder")
     if not (mark.exists() and _same_run(mark, run)):
         shutil.rmtree(portions, ignore_errors=True)
         portions.mkdir()
-        with atomic_path(mark) as temporary:
-            temporary.write_text(json.dumps(run, indent=1), encoding="utf-8")
+    with atomic_path(mark) as temporary:
+        temporary.write_text(json.dumps({**run, **holder()}, indent=1), encoding="utf-8")
     return portions
 
 

@@ -22,6 +22,8 @@ import shapely
 from probe2road.crs import WGS84, local_crs, parse_crs, require_metric, transform
 from probe2road.errors import InputError, MissingFileError
 from probe2road.graph.direction import DIRECTION_TAGS, tagged_direction
+from probe2road.io.compressed import require_bounded
+from probe2road.io.formats import GraphFormat
 from probe2road.io.osm_ways import OsmWays, read_restrictions, read_ways, split_at_shared_nodes
 from probe2road.simulation.networks.altitude import solve_heights
 from probe2road.simulation.networks.network import NetworkReport, RoadNetwork, network_from_sections
@@ -110,6 +112,7 @@ def read_network(
     """
     if not Path(path).is_file():
         raise MissingFileError("no such file", where=path, fix="check the path")
+    require_bounded(path, GraphFormat().max_uncompressed)
     found = read_ways(path, highways)
     placed = found.select_vertices(found.placed)
     ways = _usable_ways(placed)
