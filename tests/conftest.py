@@ -22,3 +22,9 @@ def untouched_log() -> None:
     logger.handlers.clear()
     logger.setLevel(logging.NOTSET)
     logger.propagate = True
+
+
+@pytest.fixture(autouse=True)
+def repeatable_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run the network alike on every processor, with or without OpenVINO and bfloat16."""
+    monkeypatch.setattr("probe2road.segmentation.runtime._fastest", lambda device: "onnxruntime")

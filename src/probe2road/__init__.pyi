@@ -60,6 +60,7 @@ from .matching.match import match as match
 from .matching.models import PublishedModel as PublishedModel
 from .matching.models import RouteModel as RouteModel
 from .matching.osrm import OsrmOptions as OsrmOptions
+from .metrics.apart import ApartOptions as ApartOptions
 from .metrics.apls import AplsOptions as AplsOptions
 from .metrics.buffer import BufferGeoOptions as BufferGeoOptions
 from .metrics.evaluate import evaluate as evaluate

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from probe2road.segmentation.segmenter import Segmenter
-from probe2road.segmentation.tiling import add_window, predict_window, raster_windows, segment_raster
+from probe2road.segmentation.tiling import Merger, is_empty, predict_window, raster_windows, segment_raster
 from sketches import grid_of
 
 
@@ -34,9 +34,11 @@ def test_the_order_of_the_windows_does_not_matter(raster, random):
     grid = grid_of(*counts.shape[1:])
     windows = list(raster_windows(counts, grid, size=segmenter.window, halo=segmenter.halo))
     random.shuffle(windows)
-    shuffled = np.zeros(grid.shape, np.float32)
+    merger = Merger(segmenter, grid.shape)
     for window, part in windows:
-        add_window(shuffled, predict_window(segmenter, window, part, grid), window, segmenter)
+        if not is_empty(segmenter, window, part):
+            merger.add(window, predict_window(segmenter, window, part, grid))
+    shuffled = np.asarray(merger.probability())
     assert (shuffled == segment_raster(segmenter, counts, grid)).all()
     assert shuffled.max(initial=0) <= 1
 

@@ -154,7 +154,7 @@ def test_options_take_precedence_over_the_model(write_weights):
     grid = Grid(446000.0, 4636000.0, 1.0, 64, 64, crossing(n=1).crs)
     weights = read_weights(write_weights(threshold=0.4, seed_threshold=0.6))
     own = network_segmenter(weights, grid)
-    assert (own.threshold, own.seed_threshold, own.window, own.halo, own.blend) == (0.4, 0.6, 128, 64, True)
+    assert (own.threshold, own.seed_threshold, own.window, own.halo, own.blend) == (0.4, 0.6, 192, 32, True)
     assert own.parameters["model"] == "blur"
     other = network_segmenter(weights, grid, NetworkOptions(tile=512, overlap=0.25))
     assert (other.window, other.halo) == (384, 64)

@@ -1,10 +1,11 @@
+import sys
 from dataclasses import asdict
 
 import numpy as np
 import pytest
 
 from probe2road.errors import InputError, OptionError
-from probe2road.segmentation.runtime import load_network, run_network
+from probe2road.segmentation.runtime import RUNTIMES, load_network, run_network
 from probe2road.segmentation.weights import ModelInfo, network_input, pack_weights, read_weights
 
 VISION = ("traces", "lane_markings", "road_boundaries")
@@ -17,9 +18,10 @@ def tiles(n=3, channels=3, rows=64, cols=96, seed=0):
     return network_input(counts)
 
 
-@pytest.fixture
-def network(write_weights):
-    return load_network(read_weights(write_weights()), threads=1)
+@pytest.fixture(params=RUNTIMES)
+def network(request, write_weights):
+    pytest.importorskip(request.param)
+    return load_network(read_weights(write_weights()), threads=1, runtime=request.param, precision="float32")
 
 
 def test_a_line_of_traces_comes_out(network):
@@ -70,18 +72,40 @@ def test_an_unknown_device_is_an_error(write_weights):
         load_network(read_weights(write_weights()), device="tpu")
 
 
-def test_a_file_without_a_network_is_an_error(tmp_path):
+def test_openvino_where_it_cannot_be_is_an_error(write_weights, monkeypatch):
+    weights = read_weights(write_weights())
+    with pytest.raises(OptionError, match=r"runtime: OpenVINO does not run on cuda here; use onnxruntime"):
+        load_network(weights, device="cuda", runtime="openvino")
+    monkeypatch.setitem(sys.modules, "openvino", None)
+    with pytest.raises(OptionError, match=r"runtime: OpenVINO is not installed; pip install 'probe2road\[openvino\]'"):
+        load_network(weights, runtime="openvino")
+
+
+def test_a_precision_that_is_not_there_is_an_error(write_weights, monkeypatch):
+    weights, openvino = read_weights(write_weights()), pytest.importorskip("openvino")
+    with pytest.raises(OptionError, match="precision: onnxruntime has no bfloat16"):
+        load_network(weights, runtime="onnxruntime", precision="bfloat16")
+    monkeypatch.setattr(openvino.Core, "get_property", lambda *names: ["FP32"])
+    with pytest.raises(OptionError, match="precision: this processor has no bfloat16; use float32"):
+        load_network(weights, runtime="openvino", precision="bfloat16")
+
+
+@pytest.mark.parametrize("runtime", RUNTIMES)
+def test_a_file_without_a_network_is_an_error(tmp_path, runtime):
+    pytest.importorskip(runtime)
     path = tmp_path / "empty.onnx"
     path.write_bytes(pack_weights(b"", ModelInfo("empty", ("traces",))))
-    with pytest.raises(InputError, match=r"empty\.onnx: onnxruntime cannot load the weights"):
-        load_network(read_weights(path))
+    with pytest.raises(InputError, match=r"empty\.onnx: (onnxruntime cannot load|the network does not take)"):
+        load_network(read_weights(path), runtime=runtime)
 
 
-def test_metadata_of_another_network_are_an_error(tmp_path, blur_model):
+@pytest.mark.parametrize("runtime", RUNTIMES)
+def test_metadata_of_another_network_are_an_error(tmp_path, blur_model, runtime):
+    pytest.importorskip(runtime)
     path = tmp_path / "mixed.onnx"
     path.write_bytes(pack_weights(blur_model(3), ModelInfo("other", ("traces",))))
     with pytest.raises(InputError, match="does not take 1 channels as its metadata say"):
-        load_network(read_weights(path))
+        load_network(read_weights(path), runtime=runtime)
 
 
 @pytest.fixture(scope="module")

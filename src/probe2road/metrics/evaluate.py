@@ -12,6 +12,7 @@ import pandas as pd
 from probe2road.crs import extents_apart
 from probe2road.errors import OptionError
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.metrics.apart import ApartOptions, apart_networks
 from probe2road.metrics.apls import AplsOptions, apls_networks
 from probe2road.metrics.buffer import BufferGeoOptions, buffer_geo_networks
 from probe2road.metrics.geo import GeoOptions, geo_networks
@@ -37,6 +38,7 @@ MetricOptions = (
     | GraphSamplingOptions
     | JunctionOptions
     | LateralOptions
+    | ApartOptions
 )
 
 # The short names of metrics with their default parameters, for the command line and for quick calls.
@@ -50,6 +52,7 @@ METRICS: dict[str, MetricOptions] = {
     "graph_sampling": GraphSamplingOptions(),
     "junctions": JunctionOptions(),
     "lateral": LateralOptions(),
+    "apart": ApartOptions(),
 }
 DEFAULT_METRICS = ("geo", "itopo", "itopo_strict", "topo", "apls")
 
@@ -62,6 +65,7 @@ _SCORERS: dict[type, Callable[..., Score | list[Score]]] = {
     GraphSamplingOptions: graph_sampling_networks,
     JunctionOptions: junctions_networks,
     LateralOptions: lateral_networks,
+    ApartOptions: apart_networks,
 }
 
 

@@ -89,7 +89,7 @@ def export(network: nn.Module, info: ModelInfo, path: str | Path, *, half: bool 
     data = pack_weights(onnx_model.SerializeToString(deterministic=True), info)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
-        stored = run_network(load_network(read_weights(temporary)), tiles)
+        stored = run_network(load_network(read_weights(temporary), runtime="onnxruntime"), tiles)
         difference = float(np.abs(stored - _run_torch(model, tiles)).max())
         if not difference <= _TOLERANCE:
             raise OutputError(f"onnxruntime and torch differ by {difference:.2g} in probability", where=path)

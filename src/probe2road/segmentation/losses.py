@@ -20,9 +20,9 @@ from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
-from probe2road.bounds import NotNegative, Positive, Probability
+from probe2road.bounds import AtLeast, NotNegative, Positive, Probability
 from probe2road.errors import InputError, needs_extra
 from probe2road.options import checked
 from probe2road.segmentation.connectivity import Buffer, connectivity_weights
@@ -31,9 +31,9 @@ from probe2road.vectorize.skeleton import Method
 with needs_extra("train", feature="training the segmentation network"):
     import torch
     from torch import Tensor
-    from torch.nn.functional import logsigmoid
+    from torch.nn.functional import logsigmoid, max_pool2d, pad
 
-__all__ = ["Loss", "LossOptions", "bce_dice", "cp_loss", "loss_function"]
+__all__ = ["Loss", "LossOptions", "bce_dice", "cp_loss", "gaps", "loss_function"]
 
 Loss = Callable[[Tensor, Tensor, int], Tensor]
 """Logits, target and the number of the training step (from 0) to the loss, a scalar."""
@@ -54,10 +54,20 @@ class LossOptions:
     thinning: Method = "zhang_suen"  # thinning for CP-loss: zhang_suen (as in its source) or guo_hall
     threshold: Probability = 0.5  # probability from which a pixel is in the mask that is thinned
     ce_weight: NotNegative[float] = 1.0  # weight of the mean cross entropy beside the Dice term, in both losses
+    gap_weight: Annotated[float, AtLeast(1)] = 1.0  # how often background between close lines counts; BCE + Dice only
+    gap_width: Positive[int] = 6  # px, largest width of the background between close lines
     smooth: NotNegative[float] = 1.0  # pixels added above and below the fraction of the Dice term
 
 
-def bce_dice(logits: Tensor, target: Tensor, *, ce_weight: float = 1.0, smooth: float = 1.0) -> Tensor:
+def bce_dice(
+    logits: Tensor,
+    target: Tensor,
+    *,
+    ce_weight: float = 1.0,
+    smooth: float = 1.0,
+    gap_weight: float = 1.0,
+    gap_width: int = 6,
+) -> Tensor:
     """Return mean binary cross entropy plus soft Dice loss, pooled over all pixels of the batch.
 
     A batch without road is fine unless ``smooth`` is 0; then its Dice term is 1.
@@ -72,6 +82,8 @@ def bce_dice(logits: Tensor, target: Tensor, *, ce_weight: float = 1.0, smooth: 
         Weight of the cross entropy; the Dice term has weight 1.
     smooth
         Added to numerator and denominator of the Dice coefficient, pixels.
+    gap_weight, gap_width
+        How often a pixel of `gaps` counts in the cross entropy, so that close lines stay two.
 
     Returns
     -------
@@ -85,7 +97,8 @@ def bce_dice(logits: Tensor, target: Tensor, *, ce_weight: float = 1.0, smooth: 
 
     Notes
     -----
-    METHOD 1.3, with a smoothing term.
+    METHOD 1.3, with a smoothing term. The weight between close lines follows the border weights of Ronneberger,
+    Fischer and Brox, "U-Net", MICCAI 2015.
 
     Examples
     --------
@@ -96,8 +109,36 @@ def bce_dice(logits: Tensor, target: Tensor, *, ce_weight: float = 1.0, smooth: 
     """
     x, g = _in_float32(logits, target)
     p = torch.sigmoid(x)
-    entropy = -(g * logsigmoid(x) + (1 - g) * logsigmoid(-x)).mean()
-    return ce_weight * entropy + _dice(2 * (p * g).sum(), p.sum() + g.sum(), smooth)
+    entropy = -(g * logsigmoid(x) + (1 - g) * logsigmoid(-x))
+    if gap_weight != 1.0:
+        entropy = entropy * (1 + (gap_weight - 1) * gaps(g, gap_width))
+    return ce_weight * entropy.mean() + _dice(2 * (p * g).sum(), p.sum() + g.sum(), smooth)
+
+
+def gaps(target: Tensor, width: int) -> Tensor:
+    """Mark the background between lines that are close to each other, by closing with a square.
+
+    Parameters
+    ----------
+    target
+        1 on road and 0 elsewhere, shape ``(..., rows, cols)``.
+    width
+        Largest width of such background along rows or columns, pixels.
+
+    Returns
+    -------
+    Tensor
+        1 between close lines and 0 elsewhere, same shape and type.
+
+    Examples
+    --------
+    >>> [gaps(torch.tensor([[1.0, 0, 0, 1, 0, 0, 0, 1]]), width)[0].int().tolist() for width in (2, 3)]
+    [[0, 1, 1, 0, 0, 0, 0, 0], [0, 1, 1, 0, 1, 1, 1, 0]]
+    """
+    wide = pad(target.reshape(-1, *target.shape[-2:]), [width] * 4)
+    dilated = max_pool2d(wide, width + 1, stride=1)
+    closed = -max_pool2d(-dilated, width + 1, stride=1)
+    return closed.view_as(target) * (1 - target)
 
 
 def cp_loss(
@@ -178,7 +219,13 @@ def loss_function(options: LossOptions | None = None) -> Loss:
     """
     options = options or LossOptions()
     pool = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="cp-loss")  # it starts threads when they are needed
-    warm_up = partial(bce_dice, ce_weight=options.ce_weight, smooth=options.smooth)
+    warm_up = partial(
+        bce_dice,
+        ce_weight=options.ce_weight,
+        smooth=options.smooth,
+        gap_weight=options.gap_weight,
+        gap_width=options.gap_width,
+    )
     connecting = partial(cp_loss, ce_weight=options.ce_weight, smooth=options.smooth)
 
     def loss(logits: Tensor, target: Tensor, step: int) -> Tensor:

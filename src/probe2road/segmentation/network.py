@@ -17,7 +17,7 @@ from probe2road.fleet.contract import Fleet
 from probe2road.options import checked
 from probe2road.raster.counts import CHANNELS
 from probe2road.raster.grid import Grid
-from probe2road.segmentation.runtime import DEVICES, load_network, run_network
+from probe2road.segmentation.runtime import DEVICES, PRECISIONS, RUNTIMES, load_network, run_network
 from probe2road.segmentation.segmenter import Segmenter
 from probe2road.segmentation.weights import Weights, network_input, read_weights
 
@@ -37,8 +37,10 @@ class NetworkOptions:
     weights: str | None = None  # file; None: the shipped one that suits the fleet
     device: Annotated[str, OneOf(*DEVICES)] = "cpu"  # or "cuda"
     threads: Positive[int] | None = None  # largest number of threads; None: one for each core
+    runtime: Annotated[str, OneOf(*RUNTIMES)] | None = None  # None: OpenVINO where it is installed, else onnxruntime
+    precision: Annotated[str, OneOf(*PRECISIONS)] | None = None  # None: bfloat16 where processor and runtime have it
     tile: Positive[int] | None = None  # px, side of the tiles that the network sees; None: that of the model
-    overlap: Annotated[float, AtLeast(0), AtMost(0.9)] = 0.5  # overlap of neighbouring tiles, as a share of their side
+    overlap: Annotated[float, AtLeast(0), AtMost(0.9)] = 0.25  # of neighbouring tiles, share of their side; paper: 0.5
     turns: Annotated[int, AtLeast(1), AtMost(4)] = 1  # rotations of every tile by right angles, whose mean is taken
 
 
@@ -117,7 +119,13 @@ def network_segmenter(weights: Weights, grid: Grid, options: NetworkOptions | No
             where=weights.path,
             fix=f'use resolution={info.resolution} or segmenter="density"',
         )
-    network = load_network(weights, device=options.device, threads=options.threads)
+    network = load_network(
+        weights,
+        device=options.device,
+        threads=options.threads,
+        runtime=options.runtime,
+        precision=options.precision,
+    )
     channels = [CHANNELS.index(name) for name in info.channels]
     halo = int(info.tile * options.overlap / 2)
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 
-import numpy as np
-
 from probe2road.fleet.contract import Fleet
 from probe2road.raster.blocks import Blocks
 from probe2road.raster.counts import rasterize_windows
@@ -17,7 +15,7 @@ from probe2road.segmentation.density import DensityOptions, density_segmenter
 from probe2road.segmentation.network import network_segmenter
 from probe2road.segmentation.options import SegmentationOptions
 from probe2road.segmentation.segmenter import Segmenter
-from probe2road.segmentation.tiling import add_window, predict_window
+from probe2road.segmentation.tiling import Merger, is_empty, predict_window
 from probe2road.segmentation.weights import Weights
 
 __all__ = ["centreline_probability", "find_segmenter"]
@@ -93,20 +91,22 @@ def centreline_probability(
     work, report = workspace or Workspace(), progress or silent
     if (kept := work.read_raster(PROBABILITY, grid)) is not None:
         return kept
-    probability = Blocks(grid.shape, np.float32)
-    driven = 0
+    merger, seen = Merger(segmenter, grid.shape), 0
     for window, counts in rasterize_windows(fleet, grid, size=segmenter.window, halo=segmenter.halo, gaps=options.gaps):
         report("segmentation", window.row, grid.rows)
+        if is_empty(segmenter, window, counts):
+            continue
         part = f"{window.row}-{window.col}"
         arrays = work.read_arrays(WINDOW, part)
         if arrays is None:
             arrays = {"probability": predict_window(segmenter, window, counts, grid)}
             work.write_arrays(WINDOW, part, **arrays)
-        add_window(probability, arrays["probability"], window, segmenter)
-        driven += 1
+        merger.add(window, arrays["probability"])
+        seen += 1
+    probability = merger.probability()
     report("segmentation", grid.rows, grid.rows)
     total = -(-grid.rows // segmenter.window) * -(-grid.cols // segmenter.window)
-    logger.info("segmented %d windows of %d of %d px (%s)", driven, total, segmenter.window, segmenter.name)
+    logger.info("segmented %d windows of %d of %d px (%s)", seen, total, segmenter.window, segmenter.name)
     work.write_raster(PROBABILITY, probability, grid)
     work.drop(WINDOW)
     return probability

@@ -1,16 +1,17 @@
-"""Segmenters on areas of any size: window by window, with overlapping windows merged.
+"""Segmenters on areas of any size: window by window, overlapping windows merged.
 
 Strategy
 --------
 An area is cut into windows with a halo around each, the same windows whatever is in them. What a segmenter does not
-blend counts in the window alone. What it blends counts in the halo as well, with a weight that falls linearly from 1
-at the centre to 0.5 at the border, by Chebyshev distance, and is divided by the weights of all windows that reach the
-pixel: with a halo of half a window, tiles that overlap by half.
+blend counts in the window alone. What it blends counts in the halo as well: a pixel gets the weighted mean of all
+windows that looked at it, where the weight of a window falls linearly from 1 at its centre to 0.5 at the border of
+its halo, by Chebyshev distance. With a halo of half a window, tiles overlap by half.
 
-Windows are merged into one array by addition, in any order. Each addend is rounded down to a multiple of 2^-24, and
-sums of such numbers up to 1 are exact in single precision: the order cannot show, and no second array has to hold the
-weights. A window that nothing touches has no road and is never looked at, but its weight counts. Pages of the array
-that are far from any trace are never touched either.
+A window that is blended and that nobody drove in is never looked at, and has no say in the halo: every road lies
+inside another window. What was not looked at has no road.
+
+Sums are of integers, so that windows can come in any order and the result is the same to the last digit. Pages of
+memory that are far from any trace are never touched.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ from numpy.typing import NDArray
 
 from probe2road.errors import InputError
 from probe2road.raster.blocks import Blocks
-from probe2road.raster.grid import Grid, Window, sparse_zeros
+from probe2road.raster.grid import Grid, Window
 from probe2road.segmentation.segmenter import Segmenter
 
-__all__ = ["add_window", "predict_window", "raster_windows", "segment_raster"]
+__all__ = ["Merger", "is_empty", "predict_window", "raster_windows", "segment_raster"]
 
-_STEPS = 2.0**24  # of the probability between 0 and 1: single precision can represent all of them
+_STEPS = 2**16  # of the probability between 0 and 1
+_WEIGHTS = 128  # of the weight between 0 and 1: a hundred windows on one pixel stay within 32 bits
 
 
 def segment_raster(segmenter: Segmenter, counts: NDArray[Any], grid: Grid) -> NDArray[np.float32]:
@@ -76,10 +78,11 @@ def segment_raster(segmenter: Segmenter, counts: NDArray[Any], grid: Grid) -> ND
         raise InputError(
             f"{faulty} values are negative, NaN or infinite", where="raster", fix="give counts, with 0 for no data"
         )
-    probability = sparse_zeros(grid.shape, np.float32)
+    merger = Merger(segmenter, grid.shape)
     for window, part in raster_windows(counts, grid, size=segmenter.window, halo=segmenter.halo):
-        add_window(probability, predict_window(segmenter, window, part, grid), window, segmenter)
-    return probability
+        if not is_empty(segmenter, window, part):
+            merger.add(window, predict_window(segmenter, window, part, grid))
+    return np.asarray(merger.probability())
 
 
 def raster_windows(counts: NDArray[Any], grid: Grid, *, size: int, halo: int) -> Iterator[tuple[Window, NDArray[Any]]]:
@@ -99,8 +102,19 @@ def raster_windows(counts: NDArray[Any], grid: Grid, *, size: int, halo: int) ->
         yield window, part
 
 
+def is_empty(segmenter: Segmenter, window: Window, counts: NDArray[Any]) -> bool:
+    """Return whether a window need not be looked at, because all there is lies inside other windows.
+
+    Parameters
+    ----------
+    segmenter, window, counts
+        As for `predict_window`.
+    """
+    return not (counts[:, *window.inner] if segmenter.blend else counts).any()
+
+
 def predict_window(segmenter: Segmenter, window: Window, counts: NDArray[Any], grid: Grid) -> NDArray[np.float32]:
-    """Return the output of a segmenter for a window: its own pixels or, with blending, the pixels of the halo, too.
+    """Return what a segmenter says about a window: its pixels, or with blending those of the halo too.
 
     Parameters
     ----------
@@ -113,45 +127,59 @@ def predict_window(segmenter: Segmenter, window: Window, counts: NDArray[Any], g
     grid
         Grid of the whole area.
     """
-    if not counts.any():
-        probability = np.zeros(counts.shape[1:], np.float32)
-    else:
-        probability = segmenter.predict(counts, window.grid(grid))
+    probability = segmenter.predict(counts, window.grid(grid))
     return probability if segmenter.blend else probability[window.inner]
 
 
-def add_window(
-    probability: NDArray[np.float32] | Blocks, part: NDArray[np.float32], window: Window, segmenter: Segmenter
-) -> None:
-    """Merge what `predict_window` returned into the probability of the whole area.
-
-    Every window must be merged once. The order has no influence on the result, not even in the last digit.
+class Merger:
+    """The probability of a whole area while its windows come in, in any order and each of them once.
 
     Parameters
     ----------
-    probability
-        Shape ``(rows, cols)``, zeros at first; changed in place.
-    part
-        Of one window.
-    window
-        Which one.
     segmenter
-        Which said so.
+        Whose windows they are.
+    shape
+        Rows and columns of the area.
+
+    Examples
+    --------
+    >>> from probe2road.raster.grid import Grid
+    >>> def certain(counts, grid): return np.ones(counts.shape[1:], np.float32)
+    >>> segmenter = Segmenter("certain", certain, window=4, halo=1, blend=True, threshold=0.5, seed_threshold=0.5,
+    ...                       parameters={})
+    >>> merger = Merger(segmenter, (4, 8))
+    >>> left, right = Grid(446000.0, 4636000.0, 1.0, 4, 8, "EPSG:32616").windows(4, halo=1)
+    >>> merger.add(left, np.full((6, 6), 0.5, np.float32))
+    >>> np.asarray(merger.probability())[0].tolist()
+    [0.5, 0.5, 0.5, 0.5, 0.5, 0.0, 0.0, 0.0]
     """
-    if not segmenter.blend:
-        probability[window.core] = part
-        return
-    target, source = _overlap(window, probability.shape)
-    neighbours = (
-        _neighbours(first, length, segmenter)
-        for first, length in zip((window.row, window.col), probability.shape, strict=True)
-    )
-    share = _share(segmenter.window, segmenter.halo, *neighbours)[: part.shape[0], : part.shape[1]]
-    probability[target] += (np.floor(part * share * _STEPS) / _STEPS).astype(np.float32)[source]
+
+    def __init__(self, segmenter: Segmenter, shape: tuple[int, int]) -> None:
+        self._segmenter = segmenter
+        self._sum, self._weight = Blocks(shape, np.uint32), Blocks(shape, np.uint16)
+
+    def add(self, window: Window, part: NDArray[np.float32]) -> None:
+        """Take in what `predict_window` returned for a window."""
+        steps = np.rint(part * np.float32(_STEPS)).astype(np.uint32)
+        if not self._segmenter.blend:
+            self._sum[window.core], self._weight[window.core] = steps, 1
+            return
+        target, source = _overlap(window, self._sum.shape)
+        weight = _weights(self._segmenter.window + 2 * self._segmenter.halo)[: part.shape[0], : part.shape[1]]
+        self._sum[target] += (steps * weight)[source]
+        self._weight[target] += weight[source]
+
+    def probability(self) -> Blocks:
+        """Return the mean of the windows so far; 0 where none has looked."""
+        merged = Blocks(self._sum.shape, np.float32)
+        for block, total in self._sum.filled.items():
+            mean = total / np.maximum(self._weight.filled[block], 1) / _STEPS
+            merged.filled[block] = mean.astype(np.float32)
+        return merged
 
 
 def _overlap(window: Window, shape: tuple[int, int]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Return which pixels of a window and its halo lie in an area: rows and columns in the area and in the window."""
+    """Return the pixels of a window and its halo that an area has: in the area, and in the window's own array."""
     target, source = [], []
     for first, count, length in zip((window.row, window.col), (window.rows, window.cols), shape, strict=True):
         start = first - window.halo
@@ -161,32 +189,10 @@ def _overlap(window: Window, shape: tuple[int, int]) -> tuple[tuple[slice, slice
     return (target[0], target[1]), (source[0], source[1])
 
 
-def _neighbours(first: int, length: int, segmenter: Segmenter) -> tuple[int, int]:
-    """Return how many windows before and after the one at ``first`` overlap with it, along an axis."""
-    size = segmenter.window
-    reach = -(-2 * segmenter.halo // size)
-    return min(first // size, reach), min(-(-(length - first) // size) - 1, reach)
-
-
 @lru_cache(maxsize=32)
-def _share(size: int, halo: int, rows: tuple[int, int], cols: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the weight of a window in each of its pixels and those of its halo; weights of all windows sum to 1.
-
-    ``rows`` and ``cols`` are how many windows before and after overlap with it along the axes.
-    """
-    side = size + 2 * halo
-    offset = np.abs(2 * np.arange(side) + 1 - side)  # from the centre, half pixels
-    weight = 2 * side - np.maximum.outer(offset, offset)  # 1 at the centre to 0.5 at the border, times 2 side
-    total = np.zeros((side, side), np.int64)
-    for row in range(-rows[0], rows[1] + 1):
-        for col in range(-cols[0], cols[1] + 1):
-            own, other = zip(*(_shifted(step * size, side) for step in (row, col)), strict=True)
-            total[own] += weight[other]
-    share: NDArray[np.float64] = weight / total
-    share.flags.writeable = False  # it is shared between calls
-    return share
-
-
-def _shifted(shift: int, side: int) -> tuple[slice, slice]:
-    """Return where two tiles overlap along an axis, in the pixels of each; the second is ``shift`` pixels ahead."""
-    return slice(max(0, shift), side + min(0, shift)), slice(max(0, -shift), side - max(0, shift))
+def _weights(side: int) -> NDArray[np.uint16]:
+    """Return the weights of the pixels of a tile, from _WEIGHTS at the centre to half of that at the border."""
+    offset = np.abs(2 * np.arange(side) + 1 - side) / side  # from the centre, in half sides
+    weight = np.rint(_WEIGHTS * (1 - np.maximum.outer(offset, offset) / 2)).astype(np.uint16)
+    weight.flags.writeable = False  # it is shared between calls
+    return weight

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from probe2road.errors import InputError
 from probe2road.graph.clean import clean_graph
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.metrics.apart import apart
 from probe2road.metrics.geo import geo
 from probe2road.metrics.itopo import itopo
 from probe2road.metrics.normalise import clip_graph
@@ -93,7 +94,8 @@ def validate(
     Returns
     -------
     dict
-        ``soft_f1``, ``geo_f1``, ``geo_precision``, ``geo_recall``, ``itopo_f1``, and ``score``, the mean of soft F1 and
+        ``soft_f1``, ``geo_f1``, ``geo_precision``, ``geo_recall``, ``itopo_f1``, ``apart`` (the recall of
+        `probe2road.metrics.apart.apart`), and ``score``, the mean of soft F1 and
         GEO F1, which chooses the checkpoint: a loss cannot (METHOD 2.4).
 
     Raises
@@ -109,13 +111,14 @@ def validate(
         graphs = [
             clean_graph(vectorize(skeletonize(mask), part.grid)) for mask, part in zip(masks, squares, strict=True)
         ]
-    place, ways = (
+    place, ways, close = (
         _pooled([metric(graph, part.reference) for graph, part in zip(graphs, squares, strict=True)])
-        for metric in (geo, itopo)
+        for metric in (geo, itopo, apart)
     )
     return {
         "score": (soft.f1 + place.f1) / 2, "soft_f1": soft.f1,
         "geo_f1": place.f1, "geo_precision": place.precision, "geo_recall": place.recall, "itopo_f1": ways.f1,
+        "apart": close.recall,
     }  # fmt: skip
 
 
