@@ -11,11 +11,15 @@ ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 # The theme prints advertising for itself about MkDocs 2 on every build; it is no warning about our pages.
 MKDOCS := NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs
 
-.PHONY: help demo test format lint types docs docs-serve test-minimum test-all-pythons bench release-check clean
+# OSRM's programs, where `make programs` has put them.
+export PROBE2ROAD_OSRM ?= $(wildcard $(CURDIR)/.programs/osrm)
+
+.PHONY: help demo test programs format lint types docs docs-serve test-minimum test-all-pythons bench release-check clean
 
 help:
 	@echo 'make demo        set up and run the main job on built-in data; results in demo-output/'
 	@echo 'make test        set up and run every check'
+	@echo 'make programs    install Chromium and OSRM, without which some checks are skipped'
 	@echo 'make format      rewrite the code in the style of the formatter'
 	@echo 'make docs-serve  show the documentation at http://127.0.0.1:8000'
 	@echo 'make test-minimum      run a part of the tests with the oldest dependencies that are declared'
@@ -30,6 +34,9 @@ demo: $(VENV)/.core-installed
 # Pytest runs last, so that its summary closes the output.
 test: lint types docs
 	$(ONE_THREAD) $(BIN)/python -m pytest -n 2
+
+programs: $(VENV)/.dev-installed
+	tools/install_programs.sh
 
 lint: $(VENV)/.dev-installed
 	$(BIN)/ruff format --check
@@ -81,7 +88,7 @@ release-check:
 	.venv-release/bin/python tools/check_release.py dist
 
 clean:
-	rm -rf $(VENV) .venv-minimum .venv-release .venv-3.1[123] dist site demo-output .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .programs .venv-minimum .venv-release .venv-3.1[123] dist site demo-output .mypy_cache .pytest_cache .ruff_cache .hypothesis
 
 # The stamps say what the environment holds; both are redone when pyproject.toml or the constraints change.
 $(VENV)/.created:
