@@ -19,6 +19,8 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
+import numpy as np
+
 __all__ = [
     "MAPPINGS",
     "Above",
@@ -144,8 +146,8 @@ class MisfitError(Exception):
 def fitted(value: Any, hint: Any, name: str) -> Any:
     """Return a value converted to its annotation, or raise MisfitError.
 
-    A whole number becomes a float where one is wanted (never the reverse), a list becomes a tuple, text becomes a
-    path, and numbers of NumPy become those of Python. A number is finite; ``True`` is none.
+    A whole number becomes a float where one is wanted (never the reverse), a list or an array becomes a tuple, text
+    becomes a path, and numbers of NumPy become those of Python. A number is finite; ``True`` is none.
 
     Parameters
     ----------
@@ -207,6 +209,7 @@ def _converted(value: Any, kind: Any, name: str) -> Any:
 
 def _converted_list(value: Any, kinds: tuple[Any, ...], name: str) -> Any:
     """Return a list as a tuple of types; the last type may be an ellipsis."""
+    value = value.tolist() if isinstance(value, np.ndarray) else value
     if not isinstance(value, tuple | list):
         return MISSING
     if kinds[-1] is Ellipsis:
@@ -250,7 +253,7 @@ def _words(hint: Any) -> str:
         return "a mapping (in TOML a table)"
     if is_dataclass(kind):
         return f"{getattr(kind, '__name__', kind)} (in TOML a table)"
-    return {bool: "true or false", Path: "a path", NoneType: "None"}.get(kind, str(kind))
+    return {bool: "true or false", Path: "a path", NoneType: "None"}.get(kind, kind.__name__)
 
 
 def _listed(words: Sequence[str]) -> str:

@@ -71,10 +71,11 @@ def test_toml_says_it_in_the_same_words(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({"header": "no"}, "header"),
         ({"column": {}}, "there is no option 'column'"),
         ({"bbox": [0, 1, 2]}, "bbox"),
         ({"bbox": [2, 0, 1, 3]}, "bbox .* is no box"),
+        ({"crs": 3.5}, "crs is 3.5; use CRS, text, a whole number or None"),
+        ({"header": "no"}, "header is 'no'; use true or false"),
         ({"delimiter": "::"}, "delimiter '::' is not one character"),
     ],
 )
