@@ -139,7 +139,7 @@ def _with_onnxruntime(weights: Weights, device: str, threads: int | None, precis
     if device == "cuda" and session.get_providers()[0] != _CUDA[0]:
         raise _absent(device)
     _require_channels(weights, [value.shape for value in inputs], len(outputs))
-    return lambda tile: session.run(None, {inputs[0].name: tile})[0]  # type: ignore[no-any-return]
+    return lambda tile: session.run(None, {inputs[0].name: tile})[0]
 
 
 def _with_openvino(weights: Weights, device: str, threads: int | None, precision: str | None) -> _Infer:
@@ -172,7 +172,7 @@ def _with_openvino(weights: Weights, device: str, threads: int | None, precision
     _require_channels(weights, shapes, len(model.outputs))
     request = compiled.create_infer_request()
     logger.info("running the network with OpenVINO in %s", chosen)
-    return lambda tile: request.infer({0: tile})[compiled.output(0)]  # type: ignore[no-any-return]
+    return lambda tile: request.infer({0: tile})[compiled.output(0)]
 
 
 def _require_channels(weights: Weights, shapes: list[list[Any]], outputs: int) -> None:
