@@ -229,7 +229,7 @@ def test_bbox_skips_row_groups_of_native_points(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bbox", [(1, 2, 3), (3, 0, 1, 1), (0, float("nan"), 1, 1)])
 def test_a_bbox_that_is_no_box_is_refused(tmp_path: Path, bbox: tuple[float, ...]) -> None:
-    with pytest.raises(OptionError, match="bbox .*(is no box|use a list of 4 values)"):
+    with pytest.raises(OptionError, match=r"bbox .*(is no box|use a list of 4 values)"):
         read_fleet(tmp_path, bbox=bbox)  # type: ignore[arg-type]
 
 
