@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from probe2road.errors import InputError, OptionError
 from probe2road.segmentation import weights as module
-from probe2road.segmentation.weights import ModelInfo, network_input, pack_weights, read_weights
+from probe2road.segmentation.weights import ModelInfo, network_input, pack_weights, read_weights, replace_info
 
 INFO = ModelInfo(
     name="tiny",
@@ -28,6 +28,17 @@ def test_metadata_come_back_as_they_went(tmp_path):
     weights = read_weights(path)
     assert weights.info == INFO
     assert weights.path == path
+
+
+def test_other_metadata_are_as_if_written_at_once(write_weights):
+    path = write_weights(name="plain")
+    before = path.read_bytes()
+    model = before[: before.index(b"probe2road") - 4]
+    replace_info(path, replace(read_weights(path).info, threshold=0.3))
+    assert read_weights(path).info.threshold == 0.3
+    assert path.read_bytes().startswith(model)
+    replace_info(path, replace(read_weights(path).info, threshold=0.5))
+    assert path.read_bytes() == before
 
 
 def test_the_file_is_an_ordinary_onnx_model(write_weights):

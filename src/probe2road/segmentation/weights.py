@@ -22,9 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from probe2road.bounds import NotEmpty, Positive, Probability
 from probe2road.errors import InputError, MissingFileError, OptionError
+from probe2road.io.atomic import atomic_path
 from probe2road.options import checked
 
-__all__ = ["FORMAT", "ModelInfo", "Weights", "network_input", "pack_weights", "read_weights"]
+__all__ = ["FORMAT", "ModelInfo", "Weights", "network_input", "pack_weights", "read_weights", "replace_info"]
 
 FORMAT = 1  # raised when older versions of probe2road could not use a new file
 
@@ -99,6 +100,20 @@ def pack_weights(model: bytes, info: ModelInfo) -> bytes:
     return data + _entry(_DIGEST, _digest(data).encode())
 
 
+def replace_info(path: str | Path, info: ModelInfo) -> None:
+    """Write other metadata into a weights file; the network in it stays as it is.
+
+    Raises
+    ------
+    InputError
+        If `read_weights` cannot read the file.
+    """
+    data = read_weights(path).model
+    ours = (start for number, start, content in _fields(data) if number == _METADATA_FIELD and _key(content) == _INFO)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(pack_weights(data[: next(ours)], info))
+
+
 def read_weights(path: str | Path) -> Weights:
     """Read a weights file and check that it is complete.
 
@@ -149,8 +164,7 @@ def _metadata(data: bytes, path: Path) -> tuple[bytes, str]:
     try:
         for number, start, content in _fields(data):
             if number == _METADATA_FIELD:
-                entry = {key: value for key, _, value in _fields(content)}
-                entries[entry.get(1)] = entry.get(2, b"")
+                entries[_key(content)] = {key: value for key, _, value in _fields(content)}.get(2, b"")
             place = start
     except EOFError as error:
         raise InputError("the weights are cut off, or no ONNX file", where=path, fix=_COPY) from error
@@ -162,6 +176,11 @@ def _metadata(data: bytes, path: Path) -> tuple[bytes, str]:
     if entries.get(_DIGEST) != digest.encode():
         raise InputError("the weights are damaged: their checksum differs", where=path, fix=_COPY)
     return entries[_INFO], digest
+
+
+def _key(content: bytes) -> bytes | None:
+    """Return the key of one metadata field."""
+    return next((value for number, _, value in _fields(content) if number == 1), None)
 
 
 def _entry(key: bytes, value: bytes) -> bytes:

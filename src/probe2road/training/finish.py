@@ -9,7 +9,7 @@ from pathlib import Path
 from probe2road.errors import InputError, needs_extra
 from probe2road.segmentation.dlinknet import STRIDE
 from probe2road.segmentation.export_onnx import export, load_parameters
-from probe2road.segmentation.weights import ModelInfo
+from probe2road.segmentation.weights import ModelInfo, replace_info
 from probe2road.training.config import TrainConfig
 from probe2road.training.loop import predict_squares
 from probe2road.training.state import BEST, TrainingState, build_network
@@ -75,6 +75,6 @@ def export_best(config: TrainConfig, state: TrainingState, output: str | Path, *
     scores = [chosen[name] for name in ("threshold", "soft_f1", "geo_f1")]
     logger.info("threshold %.1f: soft F1 %.3f, GEO F1 %.3f", *scores)
     at = chosen["threshold"]
-    info = replace(info, threshold=at, seed_threshold=at, training={**info.training, "thresholds": sweep})
-    export(network, info, file)
+    training = {**info.training, "thresholds": sweep}
+    replace_info(file, replace(info, threshold=at, seed_threshold=at, training=training))
     return file
