@@ -92,6 +92,7 @@ def apart_networks(proposal: Network, reference: Network, options: ApartOptions)
         matched_reference=kept,
         reference=places,
         parameters=asdict(options),
+        details={"proposal_km": round(proposal.km, 3), "reference_km": round(reference.km, 3)},
     )
 
 
