@@ -31,9 +31,10 @@ help:
 demo: $(VENV)/.core-installed
 	$(BIN)/probe2road demo demo-output
 
-# Pytest runs last, so that its summary closes the output.
+# Pytest runs last, so that its summary closes the output. Each worker begins with its own half of the files, so that what a file
+# sets up is set up once, and takes from the other's when it is done.
 test: lint types docs
-	$(ONE_THREAD) $(BIN)/python -m pytest -n 2
+	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist worksteal
 
 programs: $(VENV)/.dev-installed
 	tools/install_programs.sh
