@@ -72,6 +72,11 @@ def test_an_unknown_device_is_an_error(write_weights):
         load_network(read_weights(write_weights()), device="tpu")
 
 
+def test_an_unknown_precision_is_an_error(write_weights):
+    with pytest.raises(OptionError, match="there is no precision 'int8'; use float32 or bfloat16"):
+        load_network(read_weights(write_weights()), precision="int8")
+
+
 def test_openvino_where_it_cannot_be_is_an_error(write_weights, monkeypatch):
     weights = read_weights(write_weights())
     with pytest.raises(OptionError, match=r"runtime: OpenVINO does not run on cuda here; use onnxruntime"):

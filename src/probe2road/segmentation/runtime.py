@@ -68,7 +68,8 @@ def load_network(
     InputError
         If the runtime cannot run the network, or it is not the one that the metadata describe.
     """
-    for name, value, choices in (("device", device, DEVICES), ("runtime", runtime, RUNTIMES)):
+    given = (("device", device, DEVICES), ("runtime", runtime, RUNTIMES), ("precision", precision, PRECISIONS))
+    for name, value, choices in given:
         if value is not None and value not in choices:
             raise OptionError(f"there is no {name} {value!r}", fix=f"use {' or '.join(choices)}")
     if (runtime or _fastest(device)) == "openvino":
