@@ -109,9 +109,10 @@ def replace_info(path: str | Path, info: ModelInfo) -> None:
         If `read_weights` cannot read the file.
     """
     data = read_weights(path).model
-    ours = (start for number, start, content in _fields(data) if number == _METADATA_FIELD and _key(content) == _INFO)
+    metadata = ((start, content) for number, start, content in _fields(data) if number == _METADATA_FIELD)
+    end_of_model = next(start for start, content in metadata if _key_and_value(content)[0] == _INFO)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(pack_weights(data[: next(ours)], info))
+        temporary.write_bytes(pack_weights(data[:end_of_model], info))
 
 
 def read_weights(path: str | Path) -> Weights:
@@ -164,7 +165,8 @@ def _metadata(data: bytes, path: Path) -> tuple[bytes, str]:
     try:
         for number, start, content in _fields(data):
             if number == _METADATA_FIELD:
-                entries[_key(content)] = {key: value for key, _, value in _fields(content)}.get(2, b"")
+                key, value = _key_and_value(content)
+                entries[key] = value
             place = start
     except EOFError as error:
         raise InputError("the weights are cut off, or no ONNX file", where=path, fix=_COPY) from error
@@ -178,9 +180,10 @@ def _metadata(data: bytes, path: Path) -> tuple[bytes, str]:
     return entries[_INFO], digest
 
 
-def _key(content: bytes) -> bytes | None:
-    """Return the key of one metadata field."""
-    return next((value for number, _, value in _fields(content) if number == 1), None)
+def _key_and_value(content: bytes) -> tuple[bytes | None, bytes]:
+    """Return what one metadata field holds; the inverse of `_entry`."""
+    parts = {number: part for number, _, part in _fields(content)}
+    return parts.get(1), parts.get(2, b"")
 
 
 def _entry(key: bytes, value: bytes) -> bytes:
