@@ -14,7 +14,7 @@ import pandas as pd
 
 from probe2road.io.units import UNITS
 
-__all__ = ["degrees_of_column", "hidden_unit"]
+__all__ = ["degrees_and_minutes", "degrees_of_column", "hidden_unit"]
 
 _LIMIT = {"x": 180.0, "y": 90.0}
 _NEGATIVE = ("S", "W")
@@ -71,6 +71,18 @@ def degrees_of_column(
     return values, told
 
 
+def degrees_and_minutes(values: pd.Series) -> pd.Series:
+    """Return numbers such as 4807.038, 48 degrees and 7.038 minutes as receivers write them, in degrees.
+
+    Examples
+    --------
+    >>> degrees_and_minutes(pd.Series([4830.0, -1131.5])).tolist()
+    [48.5, -11.525]
+    """
+    size = values.abs()
+    return np.sign(values) * (size // 100 + size % 100 / 60)
+
+
 def hidden_unit(lon: pd.Series, lat: pd.Series) -> str | None:
     """Return ``"e7"`` for integers that can be nothing but degrees times 1e7, though no header says so.
 
@@ -99,7 +111,7 @@ def _scaled(values: pd.Series, axis: str, unit: str | None, *, minutes: bool) ->
     if factor != 1.0:
         return values * factor, str(unit)
     if minutes and limit < size <= 100 * limit and (values.abs() % 100 < 60).all():
-        return np.sign(values) * (values.abs() // 100 + values.abs() % 100 / 60), "degrees and minutes"
+        return degrees_and_minutes(values), "degrees and minutes"
     return values, ""
 
 

@@ -1,4 +1,4 @@
-"""Compressed files: what they hold is bounded before anything reads it, because some are made to hold too much."""
+"""Compressed files: opened by their suffix, and bounded before anything reads them, because some hold too much."""
 
 from __future__ import annotations
 
@@ -8,15 +8,21 @@ import zlib
 from contextlib import suppress
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from probe2road.errors import InputError
 
-__all__ = ["require_bounded"]
+__all__ = ["require_bounded", "unpacked"]
 
 _OPENERS: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open}
 _MOST_OF_GZIP = 1032  # bytes that deflate can make of one
 _BLOCK = 1 << 20
+
+
+def unpacked(path: str | PathLike[str]) -> BinaryIO:
+    """Open a file to read its bytes, unpacked if its final suffix is ``.gz`` or ``.bz2``."""
+    opened: BinaryIO = _OPENERS.get(Path(path).suffix.lower(), open)(path, "rb")
+    return opened
 
 
 def require_bounded(path: str | PathLike[str], gigabytes: float) -> None:
@@ -50,11 +56,11 @@ def require_bounded(path: str | PathLike[str], gigabytes: float) -> None:
     probe2road.errors.InputError: ...zeros.csv.gz: holds more than 0.0005 GB ...
     """
     path = Path(path)
-    opener, limit = _OPENERS.get(path.suffix.lower()), int(gigabytes * 1e9)
-    if opener is None or (opener is gzip.open and path.stat().st_size * _MOST_OF_GZIP <= limit):
+    suffix, limit = path.suffix.lower(), int(gigabytes * 1e9)
+    if suffix not in _OPENERS or (suffix == ".gz" and path.stat().st_size * _MOST_OF_GZIP <= limit):
         return
     size = 0
-    with suppress(OSError, EOFError, ValueError, zlib.error), opener(path) as file:
+    with suppress(OSError, EOFError, ValueError, zlib.error), unpacked(path) as file:
         while size <= limit and (block := file.read(_BLOCK)):
             size += len(block)
     if size > limit:

@@ -19,9 +19,10 @@ from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin, may_leave_out
 from probe2road.io.cells import raw_table
 from probe2road.io.columns import ColumnChoice, choose_columns
+from probe2road.io.compressed import unpacked
 from probe2road.io.formats import FleetFormat
 from probe2road.io.guard import parsing
-from probe2road.io.sources import RawTable, SourceFile, opened
+from probe2road.io.sources import RawTable, SourceFile
 
 __all__ = ["read_text_table"]
 
@@ -97,7 +98,7 @@ def read_text_table(source: SourceFile, format: FleetFormat | None = None, *, po
 def _read_head(source: SourceFile) -> _Head:
     """Read the top of a text file."""
     try:
-        with opened(source) as file:
+        with unpacked(source.path) as file:
             head = file.read(_HEAD)
     except (OSError, EOFError, zlib.error) as error:
         raise _broken(source, error) from error

@@ -18,7 +18,8 @@ import pandas as pd
 from probe2road.crs import WGS84
 from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin
-from probe2road.io.sources import RawTable, SourceFile, opened
+from probe2road.io.compressed import unpacked
+from probe2road.io.sources import RawTable, SourceFile
 
 __all__ = ["read_gpx"]
 
@@ -107,7 +108,7 @@ def _parse(source: SourceFile) -> tuple[dict[str, list[Any]], dict[str, list[Any
     parser.buffer_text = True
     _connect(parser, lists, blocks, source)
     try:
-        with opened(source) as file:
+        with unpacked(source.path) as file:
             number = 0
             while block := file.read(_BLOCK):
                 parser.Parse(block, False)

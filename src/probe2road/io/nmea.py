@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from probe2road.crs import WGS84
 from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin
-from probe2road.io.angles import degrees_of_column
+from probe2road.io.angles import degrees_and_minutes, degrees_of_column
+from probe2road.io.compressed import unpacked
 from probe2road.io.guard import parsing
-from probe2road.io.sources import RawTable, SourceFile, opened
+from probe2road.io.sources import RawTable, SourceFile
 from probe2road.io.units import UNITS
 
 __all__ = ["read_nmea"]
@@ -60,7 +61,7 @@ def read_nmea(source: SourceFile, *, invalid: str | None = None) -> RawTable:
         If no sentence holds a position, or too many checksums are wrong.
     """
     with parsing(source.path, "cannot be read as NMEA"):
-        with opened(source) as file:
+        with unpacked(source.path) as file:
             lines = [line.decode("ascii", errors="replace") for line in file.read().splitlines()]
         found = pc.extract_regex(pa.array(lines, pa.string()), _SENTENCE)
         found = pc.drop_null(found)
@@ -107,9 +108,8 @@ def _fixes(sentences: pa.StructArray) -> pd.DataFrame:
     fix = (table["time"] != table["time"].shift()).cumsum()
     table = table.groupby(fix).first()
     for axis, name, hemisphere in (("x", "lon", "ew"), ("y", "lat", "ns")):
-        numbers = pd.to_numeric(table[name], errors="coerce")
-        minutes = numbers // 100 + numbers % 100 / 60
-        table[name] = degrees_of_column(minutes, axis, hemispheres=table[hemisphere])[0]
+        angle = degrees_and_minutes(pd.to_numeric(table[name], errors="coerce"))
+        table[name] = degrees_of_column(angle, axis, hemispheres=table[hemisphere])[0]
     for name in ("z", "speed", "heading"):
         table[name] = pd.to_numeric(table[name], errors="coerce")
     table["speed"] *= UNITS["speed"]["kn"]

@@ -11,8 +11,6 @@ takes longer to fill than the nodes of a city take to read.
 
 from __future__ import annotations
 
-import bz2
-import gzip
 import re
 from collections.abc import Collection, Iterable
 from contextlib import AbstractContextManager
@@ -26,6 +24,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from osmium.filter import KeyFilter, TagFilter
 
+from probe2road.io.compressed import unpacked
 from probe2road.io.guard import parsing
 
 __all__ = [
@@ -209,13 +208,10 @@ def _with_inline_positions(ways: OsmWays, path: str | PathLike[str], wanted: Any
 
 def _marked_for_deletion(path: str | PathLike[str]) -> set[int]:
     """Return the ids of ways that JOSM has marked for deletion, which osmium does not report."""
-    name = str(path).lower()
-    opened = {".osm": open, ".gz": gzip.open, ".bz2": bz2.open}
-    opener: Any = next((opener for suffix, opener in opened.items() if name.endswith(suffix)), None)
-    if opener is None:
+    if not str(path).lower().endswith((".osm", ".gz", ".bz2")):
         return set()
     found: set[int] = set()
-    with osm_errors(path), opener(path, "rb") as file:
+    with osm_errors(path), unpacked(path) as file:
         rest = b""
         while block := file.read(_BLOCK):
             text = rest + block

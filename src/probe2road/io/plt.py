@@ -16,8 +16,9 @@ import pyarrow.csv
 from probe2road.crs import WGS84
 from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin, may_leave_out
+from probe2road.io.compressed import unpacked
 from probe2road.io.guard import parsing
-from probe2road.io.sources import RawTable, SourceFile, opened
+from probe2road.io.sources import RawTable, SourceFile
 from probe2road.io.units import UNITS
 
 __all__ = ["read_plt"]
@@ -57,7 +58,7 @@ def read_plt(source: SourceFile, *, invalid: str | None = None) -> RawTable:
         return "skip"
 
     with parsing(source.path, "cannot be read as PLT", fix="check that it has six lines above the fixes"):
-        with opened(source) as file:
+        with unpacked(source.path) as file:
             table = pyarrow.csv.read_csv(
                 file,
                 read_options=pyarrow.csv.ReadOptions(column_names=_COLUMNS, skip_rows=_LINES_ABOVE, use_threads=False),

@@ -16,9 +16,10 @@ from probe2road.errors import InputError
 from probe2road.fleet.tables import TableOrigin
 from probe2road.io.cells import raw_table
 from probe2road.io.columns import choose_columns
+from probe2road.io.compressed import unpacked
 from probe2road.io.formats import FleetFormat
 from probe2road.io.guard import parsing
-from probe2road.io.sources import RawTable, SourceFile, opened
+from probe2road.io.sources import RawTable, SourceFile
 
 __all__ = ["read_records"]
 
@@ -49,7 +50,7 @@ def read_records(source: SourceFile, format: FleetFormat | None = None, *, point
     """
     format = format or FleetFormat()
     with parsing(source.path, "cannot be read as JSON"):
-        with opened(source) as file:
+        with unpacked(source.path) as file:
             text = file.read().decode("utf-8-sig")
         found = _longest_list(_parsed(text))
     if not found:

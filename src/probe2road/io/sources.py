@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import gzip
 import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from io import BufferedIOBase
 from os import PathLike
 from pathlib import Path
 
@@ -19,8 +17,9 @@ from pyproj import CRS
 from probe2road.errors import InputError, MissingFileError
 from probe2road.fleet.tables import TableOrigin
 from probe2road.io.atomic import settled
+from probe2road.io.compressed import unpacked
 
-__all__ = ["FORMATS", "POINTS_MARK", "RawTable", "SourceFile", "find_sources", "format_of", "opened"]
+__all__ = ["FORMATS", "POINTS_MARK", "RawTable", "SourceFile", "find_sources", "format_of"]
 
 FORMATS = {
     **dict.fromkeys((".parquet", ".pq", ".geoparquet"), "parquet"),
@@ -117,20 +116,13 @@ def find_sources(
     return [SourceFile(path, format_of(path), name) for path, name in files.items()], left_out
 
 
-def opened(source: SourceFile) -> BufferedIOBase:
-    """Open a file to read its bytes, unpacked where its suffix is .gz."""
-    if source.path.suffix.lower() == ".gz":
-        return gzip.open(source.path)
-    return source.path.open("rb")
-
-
 def format_of(path: Path) -> str:
     """Return the format of a file, by its suffix and, where that is general, by its first bytes."""
     format = FORMATS[_suffix(path)]
     if format not in _BEGINNINGS:
         return format
     try:
-        with opened(SourceFile(path, format, "")) as file:
+        with unpacked(path) as file:
             head = file.read(_HEAD).removeprefix(b"\xef\xbb\xbf").lstrip()
     except (OSError, EOFError, zlib.error):
         return format  # whose reader says what is wrong
