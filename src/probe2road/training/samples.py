@@ -7,7 +7,7 @@ label of a thinned sample is what enough of the remaining drives passed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from probe2road.bounds import AtLeast, NotEmpty, NotNegative, Positive, Share
 from probe2road.options import checked
 from probe2road.raster.counts import count_pixels
 from probe2road.raster.drawing import draw_lines
+from probe2road.training.cameras import CameraOptions, Points, seen_points
 from probe2road.training.scene import Scene, rows_around
 
 __all__ = ["Sample", "SampleOptions", "Vectors", "draw_sample", "sample_vectors", "square", "square_vectors"]
@@ -49,6 +50,7 @@ class SampleOptions:
     intervals: Annotated[tuple[NotNegative[float], ...], NotEmpty()] = (0.0,)  # s between fixes, one drawn; 0 keeps all
     offsets: Annotated[tuple[NotNegative[float], ...], NotEmpty()] = (0.0,)  # m, 1 sigma of a drive's shift, one drawn
     least_points: Share = 0.3  # share of the semantic points that the poorest sample keeps
+    cameras: CameraOptions = field(default_factory=CameraOptions)  # which points are seen at all
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,15 @@ class Vectors:
         points = self.point_row, self.point_col, self.point_kind
         counts = count_pixels(self.row, self.col, self.breaks, *points, shape)
         return Sample(counts, draw_lines(self.label_row, self.label_col, self.label_edge, shape, width=label_width))
+
+
+@dataclass(frozen=True)
+class _Traces:
+    """The fixes around a frame, in driving order; coordinates in metres from the scene's origin."""
+
+    xy: NDArray[np.float32]  # (f, 2)
+    z: NDArray[np.float32]  # (f,)
+    breaks: NDArray[np.bool_]  # (f,) where no segment leads from the fix before
 
 
 @dataclass(frozen=True)
@@ -134,9 +145,12 @@ def sample_vectors(scene: Scene, rng: np.random.Generator, options: SampleOption
     interval, phase = float(rng.choice(options.intervals)), rng.random(scene.n_drives).astype(np.float32)
     fixes, late = _fixes(scene, frame, kept, reach), max(_LATE, _LATE_INTERVALS * interval)
     fixes = fixes[_sampled(scene.fix_drive[fixes], scene.fix_time[fixes], interval, phase)]
-    points = _points(scene, frame, kept, reach)
-    points = points[rng.random(len(points)) < rng.uniform(options.least_points, 1.0)]
-    return _vectors(scene, frame, fixes, points, offset, late, _labelled(scene, kept, options))
+    traces = _traces(scene, fixes, offset, late)
+    camera = rng.random(scene.n_drives) < rng.uniform(options.cameras.least_drives, 1.0)
+    recorded = _points(scene, frame, kept & camera, reach, offset)
+    seen = seen_points(recorded, traces.xy, traces.breaks, camera[scene.fix_drive[fixes]], rng, options.cameras)
+    seen = seen.chosen(rng.random(len(seen.kind)) < rng.uniform(options.least_points, 1.0))
+    return _vectors(scene, frame, traces, seen, _labelled(scene, kept, options))
 
 
 def square_vectors(scene: Scene, centre: tuple[float, float], options: SampleOptions) -> Vectors:
@@ -154,9 +168,9 @@ def square_vectors(scene: Scene, centre: tuple[float, float], options: SampleOpt
     frame = _Frame(centre, _TURNS[0], options.size)
     kept = np.ones(scene.n_drives, bool)
     reach = options.size / 2 + _SEGMENT
-    fixes, points = _fixes(scene, frame, kept, reach), _points(scene, frame, kept, reach)
     offset = np.zeros((scene.n_drives, 2), np.float32)
-    return _vectors(scene, frame, fixes, points, offset, _LATE, _labelled(scene, kept, options))
+    traces = _traces(scene, _fixes(scene, frame, kept, reach), offset, _LATE)
+    return _vectors(scene, frame, traces, _points(scene, frame, kept, reach, offset), _labelled(scene, kept, options))
 
 
 def _turn(rng: np.random.Generator, options: SampleOptions) -> NDArray[np.float64]:
@@ -197,10 +211,18 @@ def _fixes(scene: Scene, frame: _Frame, kept: NDArray[np.bool_], reach: float) -
     return fixes[kept[scene.fix_drive[fixes]]]
 
 
-def _points(scene: Scene, frame: _Frame, kept: NDArray[np.bool_], reach: float) -> NDArray[np.int64]:
-    """List the semantic points of kept drives around a frame."""
-    points = rows_around(scene.point_cells, scene.table, frame.centre, reach)
-    return points[kept[scene.point_drive[points]]]
+def _points(scene: Scene, frame: _Frame, kept: NDArray[np.bool_], reach: float, offset: NDArray[np.float32]) -> Points:
+    """Return the semantic points of kept drives around a frame; each drive is moved by its offset."""
+    rows = rows_around(scene.point_cells, scene.table, frame.centre, reach)
+    rows = rows[kept[scene.point_drive[rows]]]
+    return Points(scene.point_xy[rows] + offset[scene.point_drive[rows]], scene.point_kind[rows].astype(np.int64))
+
+
+def _traces(scene: Scene, fixes: NDArray[np.int32], offset: NDArray[np.float32], late: float) -> _Traces:
+    """Return fixes of a scene; each drive is moved by its offset."""
+    drive, xyz = scene.fix_drive[fixes], scene.fix_xyz[fixes]
+    xy = xyz[:, :2] + offset[drive]
+    return _Traces(xy, xyz[:, 2], _breaks(drive, scene.fix_time[fixes], xy, late))
 
 
 def _labelled(scene: Scene, kept: NDArray[np.bool_], options: SampleOptions) -> NDArray[np.int64]:
@@ -210,25 +232,15 @@ def _labelled(scene: Scene, kept: NDArray[np.bool_], options: SampleOptions) -> 
     return np.flatnonzero((support >= options.min_drives)[scene.vertex_edge])
 
 
-def _vectors(
-    scene: Scene,
-    frame: _Frame,
-    fixes: NDArray[np.int32],
-    points: NDArray[np.int64],
-    offset: NDArray[np.float32],
-    late: float,
-    vertices: NDArray[np.int64],
-) -> Vectors:
-    """Transform fixes, points and vertices to the pixels of a frame; each drive is moved by its offset."""
-    drive, xyz = scene.fix_drive[fixes], scene.fix_xyz[fixes]
-    xy = xyz[:, :2] + offset[drive]
-    row, col = frame.pixels(xy)
-    point_row, point_col = frame.pixels(scene.point_xy[points] + offset[scene.point_drive[points]])
+def _vectors(scene: Scene, frame: _Frame, traces: _Traces, points: Points, vertices: NDArray[np.int64]) -> Vectors:
+    """Transform traces, points and the vertices of the label to the pixels of a frame."""
+    row, col = frame.pixels(traces.xy)
+    point_row, point_col = frame.pixels(points.xy)
     label_row, label_col = frame.pixels(scene.vertex_xy[vertices])
     return Vectors(
         size=frame.size,
-        row=row, col=col, z=xyz[:, 2], breaks=_breaks(drive, scene.fix_time[fixes], xy, late),
-        point_row=point_row, point_col=point_col, point_kind=scene.point_kind[points].astype(np.int64),
+        row=row, col=col, z=traces.z, breaks=traces.breaks,
+        point_row=point_row, point_col=point_col, point_kind=points.kind,
         label_row=label_row, label_col=label_col, label_edge=scene.vertex_edge[vertices].astype(np.int64),
     )  # fmt: skip
 

@@ -15,6 +15,7 @@ from probe2road.simulation.networks.network import RoadNetwork, check_network
 
 SCENES = {kind: lambda kind=kind, **o: generate_interchange(kind, **o) for kind in INTERCHANGES} | {
     "corridor": generate_corridor,
+    "wide_corridor": lambda **o: generate_corridor(lanes=(5, 9), **o),
     "grid": lambda **o: generate_town(regular=True, **o),
     "old_town": lambda **o: generate_town(regular=False, **o),
 }
@@ -75,8 +76,8 @@ def test_every_road_can_be_reached(scene):
     graph = sparse.csr_array((np.ones(len(u)), (u, v)), shape=(len(nodes), len(nodes)))
     parts, _ = csgraph.connected_components(graph, directed=False)
     # Roads that only cross, and the carriageways of a road without a junction, stay apart.
-    expected = {"shallow_overpass": 4, "double_deck": 3, "merge_beside_bridge": 3, "weaving": 2, "corridor": 8}
-    assert parts <= expected.get(scene, 1)
+    apart = {"shallow_overpass": 4, "double_deck": 3, "merge_beside_bridge": 3, "weaving": 2}
+    assert parts <= apart.get(scene, 8 if "corridor" in scene else 1)
 
 
 @pytest.mark.parametrize(
@@ -137,6 +138,20 @@ def test_towns_have_one_level(regular):
     assert {"secondary", "residential"} <= set(network.sections["highway"])
 
 
+@pytest.mark.parametrize("lanes", [(2, 4), (5, 9)])
+def test_carriageways_of_a_corridor_stay_apart(lanes):
+    for seed in range(3):
+        sections = generate_corridor(rng=np.random.default_rng(seed), lanes=lanes).sections
+        motorway = sections[sections["highway"] == "motorway"]
+        assert motorway["lanes_forward"].between(lanes[0], lanes[1] + 1).all()  # one more beside a ramp
+        width = motorway["lanes_forward"].to_numpy() * 3.65
+        first, second = np.triu_indices(len(motorway), 1)
+        lines = motorway.geometry.to_numpy()
+        apart = shapely.distance(lines[first], lines[second])
+        abreast = apart > 1.0  # others follow each other
+        assert (apart - (width[first] + width[second]) / 2)[abreast].min() > 0.0
+
+
 def test_bad_options_are_refused():
     rng = np.random.default_rng(0)
     with pytest.raises(OptionError, match="kind of interchange 'clover' is unknown"):
@@ -149,6 +164,8 @@ def test_bad_options_are_refused():
         generate_interchange("stack", rng=rng, driving_side="both")
     with pytest.raises(OptionError, match="length is 10"):
         generate_corridor(rng=rng, length=10)
+    with pytest.raises(OptionError, match=r"lanes are \(4, 2\)"):
+        generate_corridor(rng=rng, lanes=(4, 2))
     with pytest.raises(OptionError, match="blocks is 1"):
         generate_town(rng=rng, blocks=1)
 

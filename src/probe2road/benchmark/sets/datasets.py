@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from probe2road.errors import MissingFileError, OptionError
 from probe2road.simulation.drawn.generate import INTERCHANGES, generate_corridor, generate_interchange, generate_town
 from probe2road.simulation.networks.network import RoadNetwork
 from probe2road.simulation.networks.osm import read_network
+from probe2road.simulation.networks.road_classes import CLASS_DEFAULTS
 from probe2road.simulation.presets import PRESETS, Preset, find_preset
 
 __all__ = ["DATASETS", "GROUPS", "OSM_NOTICE", "Dataset", "find_dataset", "find_datasets", "load_network"]
@@ -37,6 +39,7 @@ class Dataset:
     drive_km: float  # km driven in all
     seed: int  # of the fleet
     preset: str = "mixed"
+    roads: Literal["main", "all"] = "main"  # of an extract: main roads with the beginnings of primary ones, or all
     zipf_exponent: float = 0.7  # of the demand; the preset's 1 lets a few origins, and so the seed, decide too much
     splits: Mapping[str, int] = field(default_factory=dict)  # tiles of each split; empty where it is used as a whole
     split_seed: int = 0  # draws the blocks of tiles
@@ -73,26 +76,40 @@ _CITIES = (
     Dataset("porto", _TRAIN, "porto.osm.pbf", 12_000.0, 6),
     Dataset("milan", "validation of the shipped model", "milan.osm.pbf", 6_000.0, 7),
 )
+_STREETS = (
+    Dataset("london_streets", _TRAIN, "streets_london.osm.pbf", 500.0, 11, roads="all"),
+    Dataset("munich_streets", _TRAIN, "streets_munich.osm.pbf", 500.0, 12, roads="all"),
+    Dataset("rhein_neckar_roads", _TRAIN, "rhein_neckar.osm.pbf", 12_000.0, 13, roads="all"),
+)
 _SIDES = (("right", "DE"), ("left", "JP"))  # of the first and the second network of a kind
+_WIDE_LANES = (5, 9)  # through lanes of a wide carriageway; beside its ramps there is one more
 _INTERCHANGES = tuple(
     Dataset(f"interchange-{kind}-{seed}", _TRAIN, f"generate:{kind}:{seed}", 500.0, 100 + seed)
     for kind in INTERCHANGES
     for seed in (1, 2)
 )
 _CORRIDORS = tuple(Dataset(f"corridor-{n}", _TRAIN, f"generate:corridor:{n}", 1_000.0, 200 + n) for n in (1, 2, 3, 4))
+_WIDE = (
+    Dataset("pasadena", _TRAIN, "pasadena.osm.pbf", 400.0, 14),
+    *(Dataset(f"wide_corridor-{n}", _TRAIN, f"generate:wide_corridor:{n}", 1_500.0, 250 + n) for n in (1, 2, 3, 4)),
+)
 _TOWNS = tuple(
     Dataset(f"{kind}-{seed}", _TRAIN, f"generate:{kind}:{seed}", 500.0, 300 + seed)
     for kind in ("town", "old_town")
     for seed in (1, 2, 3, 4)
 )
 
-DATASETS: Mapping[str, Dataset] = {data.name: data for data in (*_CITIES, *_INTERCHANGES, *_CORRIDORS, *_TOWNS)}
+DATASETS: Mapping[str, Dataset] = {
+    data.name: data for data in (*_CITIES, *_STREETS, *_INTERCHANGES, *_CORRIDORS, *_WIDE, *_TOWNS)
+}
 
 GROUPS: Mapping[str, tuple[str, ...]] = {
     "cities": tuple(data.name for data in _CITIES),
     "test": ("boston", "hannover", "tokyo_shibuya"),
+    "streets": tuple(data.name for data in _STREETS),
     "interchanges": tuple(data.name for data in _INTERCHANGES),
     "corridors": tuple(data.name for data in _CORRIDORS),
+    "wide": tuple(data.name for data in _WIDE),
     "towns": tuple(data.name for data in _TOWNS),
 }
 
@@ -143,7 +160,8 @@ def find_datasets(names: list[str]) -> list[Dataset]:
 def load_network(data: Dataset, folder: str | Path) -> RoadNetwork:
     """Read or generate the roads of a data set.
 
-    Of an extract, motorways, trunk roads and their links are kept, and primary roads where they meet them.
+    Of the main roads of an extract, motorways, trunk roads and their links are kept, and primary roads where they
+    meet them.
 
     Parameters
     ----------
@@ -163,12 +181,16 @@ def load_network(data: Dataset, folder: str | Path) -> RoadNetwork:
             raise MissingFileError(
                 "there is no such extract", where=path, fix='name the folder of extracts, for example data="extracts"'
             )
+        if data.roads == "all":
+            return read_network(path, highways=tuple(CLASS_DEFAULTS))
         return main_roads(read_network(path, highways=(*MAIN_ROADS, *PRIMARY_ROADS)))
     _, kind, seed = data.network.split(":")
     rng = np.random.default_rng(int(seed))
     side, country = _SIDES[(int(seed) - 1) % 2]
     if kind == "corridor":
         return generate_corridor(rng=rng, driving_side=side, country=country)
+    if kind == "wide_corridor":
+        return generate_corridor(rng=rng, lanes=_WIDE_LANES, driving_side=side, country=country)
     if kind in ("town", "old_town"):
         return generate_town(rng=rng, regular=kind == "town", driving_side=side, country=country)
     return generate_interchange(kind, rng=rng, driving_side=side, country=country)

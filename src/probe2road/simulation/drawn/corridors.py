@@ -12,18 +12,23 @@ __all__ = ["draw_corridor"]
 
 _RAMP = 280.0  # m along the motorway from a gore to the road beside it
 _JOINT = np.radians(7.0)  # between a ramp and the road beside, so that neither bend makes them cross
+_HALF_LANE = 1.825  # m
 _SPACING = 900.0  # m between the places where ramps may be
 
 
-def draw_corridor(rng: np.random.Generator, length: float) -> list[Road]:
-    """Draw a motorway with ramps to a frontage road or a parallel carriageway on each side, and roads across it."""
+def draw_corridor(rng: np.random.Generator, length: float, lanes: tuple[int, int]) -> list[Road]:
+    """Draw a motorway with ramps to a frontage road or a parallel carriageway on each side, and roads across it.
+
+    A carriageway has from ``lanes[0]`` to ``lanes[1]`` through lanes.
+    """
     axis = wander(rng, length, radius=900.0)
     axis = np.asarray(axis - axis.mean(axis=0))
-    gap, lanes = rng.uniform(9, 14), int(rng.integers(2, 5))
+    gap, width = rng.uniform(9, 14), int(rng.integers(lanes[0], lanes[1] + 1))
+    gap += max(width - 4, 0) * _HALF_LANE  # so that more lanes leave the strip between the carriageways as it is
     roads: list[Road] = []
     for path in divided(axis, gap=gap):
         kind = rng.choice(["frontage", "parallel", "none"], p=[0.45, 0.35, 0.2])
-        roads += _side(rng, resample(path), lanes, str(kind))
+        roads += _side(rng, resample(path), width, str(kind))
     return roads + _across(rng, axis)
 
 
@@ -37,7 +42,7 @@ def _side(rng: np.random.Generator, path: Path, lanes: int, kind: str) -> list[R
     exits = [(float(s), 160.0) for s in places[leaves]]
     entries = [(float(s), 200.0) for s in places[~leaves]]
     roads, out, into = carriageway(path, lanes=lanes, exits=exits, entries=entries)
-    away = lanes * 1.825 + (rng.uniform(24, 34) if kind == "frontage" else rng.uniform(15, 19))
+    away = lanes * _HALF_LANE + (rng.uniform(24, 34) if kind == "frontage" else rng.uniform(15, 19))
     highway = "secondary" if kind == "frontage" else "motorway_link"
     beside = resample(offset_path(path, away))
     line = Road(beside, highway, 2, speed=60 / 3.6 if kind == "frontage" else 80 / 3.6)

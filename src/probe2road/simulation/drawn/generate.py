@@ -91,6 +91,7 @@ def generate_corridor(
     *,
     rng: np.random.Generator,
     length: float = 4000.0,
+    lanes: tuple[int, int] = (2, 4),
     driving_side: str = "right",
     country: str = "DE",
     crs: str = _CRS,
@@ -102,13 +103,15 @@ def generate_corridor(
     ----------
     length
         Of the motorway (m), at least 2,000.
+    lanes
+        Fewest and most through lanes of a carriageway; both carriageways get the same number.
     rng, driving_side, country, crs, heights
         As in `generate_interchange`.
 
     Raises
     ------
     OptionError
-        If the length is too short or the driving side unknown.
+        If the length is too short, the lanes are no range, or the driving side is unknown.
 
     Examples
     --------
@@ -118,7 +121,9 @@ def generate_corridor(
     """
     if not length >= 2000.0:
         raise OptionError(f"length is {length}", where="generate_corridor", fix="use 2000 m or more")
-    return _finish(draw_corridor(rng, length), "corridor", rng, driving_side, country, crs, heights)
+    if not 1 <= lanes[0] <= lanes[1]:
+        raise OptionError(f"lanes are {lanes}", where="generate_corridor", fix="use 1 <= fewest <= most")
+    return _finish(draw_corridor(rng, length, lanes), "corridor", rng, driving_side, country, crs, heights)
 
 
 def generate_town(
