@@ -71,5 +71,5 @@ def test_drives_without_a_camera_see_nothing_abreast():
 
 
 def test_more_samples_than_there_are_is_refused():
-    with pytest.raises(OptionError, match="shares add up to 1.2"):
+    with pytest.raises(OptionError, match=r"shares add up to 1\.2"):
         CameraOptions(without_points=0.6, markings_only=0.6)
