@@ -13,6 +13,7 @@ MKDOCS := NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs
 
 # OSRM's programs, where `make programs` has put them.
 export PROBE2ROAD_OSRM ?= $(wildcard $(CURDIR)/.programs/osrm)
+export PROBE2ROAD_VALHALLA ?= $(wildcard $(CURDIR)/.programs/valhalla)
 
 .PHONY: help demo test programs format lint types docs docs-serve test-minimum test-all-pythons bench release-check clean
 

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Install the programs that some tests run and the virtual environment does not hold: Chromium, which draws the HTML view,
-# and OSRM. Tests whose program is absent are skipped, so that a machine where this cannot be done passes, too.
+# and the routing engines OSRM and Valhalla. Tests whose program is absent are skipped, so that a machine where this
+# cannot be done passes, too.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -16,9 +17,11 @@ if ! has_chromium; then
   fi
 fi
 
-# The wheel holds programs that any Python can start, but is made for 3.12 and later.
-if [ ! -x .programs/osrm/osrm/bin/osrm-routed ]; then
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --only-binary :all: --python-version 3.12 \
-    --upgrade --target .programs/osrm osrm-bindings \
-    || echo 'OSRM could not be installed; the tests that need it are skipped' >&2
-fi
+# These wheels hold programs that any Python can start, but are made for 3.12 and later.
+install_router() { # NAME PACKAGE PROGRAM
+  [ -x ".programs/$1/$3" ] || .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
+    --only-binary :all: --python-version 3.12 --upgrade --target ".programs/$1" "$2" \
+    || echo "$2 could not be installed; the tests that need it are skipped" >&2
+}
+install_router osrm osrm-bindings osrm/bin/osrm-routed
+install_router valhalla pyvalhalla valhalla/bin/valhalla_service

@@ -21,6 +21,7 @@ from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.graph.tables import TURN_DTYPES
 from probe2road.io.graph_files import read_graph, write_graph
 from probe2road.io.graph_readers import read_vector_graph
+from probe2road.io.osm_writer import OsmOptions
 from sketches import EAST, NORTH, UTM
 
 
@@ -111,7 +112,7 @@ def test_osmium_reads_ways_that_share_the_junction(tee: RoadGraph, tmp_path: Pat
     one_way = replace(
         tee, edges=tee.edges.assign(forward=pd.array([9, 0, 9], "Int64"), backward=pd.array([0, 9, 9], "Int64"))
     )
-    write_graph(one_way, tmp_path / name)
+    write_graph(one_way, tmp_path / name, osm=OsmOptions(dialect="editor"))
     ways = {
         way.id: ([node.ref for node in way.nodes], dict(way.tags))
         for way in osmium.FileProcessor(str(tmp_path / name), osmium.osm.WAY)

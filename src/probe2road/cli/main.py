@@ -89,6 +89,7 @@ def build(
     refine: Annotated[bool, typer.Option(help="Let the traces fill gaps and split false junctions.")] = True,
     min_vehicles: Annotated[int, typer.Option(help="Vehicles that an edge needs to be written.")] = 1,
     min_drives: Annotated[int, typer.Option(help="Drives that an edge needs to be written.")] = 1,
+    first_id: Annotated[int, typer.Option(help="First id in OSM files for routing engines (.osm.pbf).")] = 1,
     config: Annotated[Path | None, typer.Option(help="TOML file with build options, and how to read.")] = None,
     keep_intermediate: Annotated[
         Path | None, typer.Option(help="Folder that keeps what every stage made, and a picture of it.")
@@ -102,6 +103,7 @@ def build(
     from probe2road.graph.disclosure import withhold
     from probe2road.io.fleet_reader import read_fleet
     from probe2road.io.graph_files import graph_format, write_graph
+    from probe2road.io.osm_writer import OsmOptions
     from probe2road.options import options_from_table, read_toml
     from probe2road.recipe import BuildOptions
     from probe2road.recipe import build as build_graph
@@ -113,7 +115,7 @@ def build(
     _require_folders(keep_intermediate)
     table = read_toml(config) if config else {}
     format = chosen_format(fleet_format, table, where=config)
-    options = options_from_table(table, BuildOptions, where=config)
+    options, osm = options_from_table(table, BuildOptions, where=config), OsmOptions(first_id=first_id)
     chosen: dict[str, Any] = {"segmenter": segmenter, "resolution": resolution}
     if weights or device:
         chosen |= _network_choice(options.segmentation.network, segmenter, weights, device)
@@ -126,7 +128,7 @@ def build(
         graph = build_graph(fleet, options=options, workspace=workspace, progress=progress)
         graph = withhold(graph, min_vehicles=min_vehicles, min_drives=min_drives)
         for path in output:
-            write_graph(graph, path)
+            write_graph(graph, path, osm=osm)
     if keep_intermediate:
         draw_stages(keep_intermediate, fleet, keep_intermediate / "stages.png")
     if graph.edges.empty:

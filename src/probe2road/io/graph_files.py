@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -20,15 +21,16 @@ from probe2road.io.graph_networkx import read_graphml, write_graphml
 from probe2road.io.graph_readers import read_parquet_graph, read_vector_graph
 from probe2road.io.graph_writers import write_flatgeobuf, write_geojson, write_geopackage, write_geoparquet
 from probe2road.io.guard import located
-from probe2road.io.osm import read_osm, write_osm
+from probe2road.io.osm import read_osm
 from probe2road.io.osm_json import holds_osm_json
+from probe2road.io.osm_writer import OsmOptions, write_osm
 
 __all__ = ["READABLE", "WRITABLE", "graph_format", "read_graph", "write_graph"]
 
 logger = logging.getLogger(__name__)
 
 
-def write_graph(graph: RoadGraph, path: str | PathLike[str]) -> None:
+def write_graph(graph: RoadGraph, path: str | PathLike[str], *, osm: OsmOptions | None = None) -> None:
     """Write a road graph to a file, in the format that its suffix names.
 
     The invariants are checked first, and a file is complete or absent. What each format keeps, and how
@@ -40,11 +42,13 @@ def write_graph(graph: RoadGraph, path: str | PathLike[str]) -> None:
         The graph; it may be empty.
     path
         File with a suffix of `WRITABLE`; GeoParquet puts nodes and turns in two files beside it.
+    osm
+        For whom an OSM file is written; for routing engines where the suffix is ``.osm.pbf``, else for editors.
 
     Raises
     ------
     OptionError
-        If the suffix is of no format we write.
+        If the suffix is of no format we write, or an OSM file would need ids that are too large.
     OutputError
         If the file cannot be written, or the graph holds columns that may identify drives.
     InputError
@@ -59,7 +63,8 @@ def write_graph(graph: RoadGraph, path: str | PathLike[str]) -> None:
     >>> read_graph(path)
     RoadGraph(2 nodes, 1 edges, 0.100 km, WGS 84 / UTM zone 16N)
     """
-    writer = _WRITERS[graph_format(path, WRITABLE)]
+    kind = graph_format(path, WRITABLE)
+    writer = partial(write_osm, options=osm) if kind == "OSM" else _WRITERS[kind]
     require_sound(graph, where="graph to write")
     try:
         writer(graph, path)
@@ -151,6 +156,7 @@ WRITABLE = {
     ".graphml": "GraphML",
     ".osm": "OSM",
     ".osm.pbf": "OSM",
+    ".osc": "OSM",
 }  # suffix to format
 READABLE = {**WRITABLE, ".json": "GeoJSON", ".pbf": "OSM", ".osm.gz": "OSM", ".osm.bz2": "OSM", ".shp": "Shapefile"}
 
@@ -180,5 +186,4 @@ _WRITERS: dict[str, Callable[[RoadGraph, str | PathLike[str]], None]] = {
     "FlatGeobuf": write_flatgeobuf,
     "GeoJSON": write_geojson,
     "GraphML": write_graphml,
-    "OSM": write_osm,
 }

@@ -1,20 +1,11 @@
-"""OpenStreetMap files: extracts as reference graphs, and our graphs for JOSM, Valhalla and OSRM.
-
-Coordinates in OSM files are whole multiples of 1e-7 degrees, 1 cm. Objects that we make have negative ids,
-which every OSM tool takes for "not uploaded". A road is a way, a junction a node that ways share, a height
-the node's ``ele``. What OSM has no tag for is kept under the prefix ``probe2road:``; editors should remove
-those tags before an upload.
-"""
+"""Reading of OpenStreetMap files: extracts as reference graphs, and what `probe2road.io.osm_writer` wrote."""
 
 from __future__ import annotations
 
-import ctypes
 import logging
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from dataclasses import replace
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import geopandas as gpd
@@ -25,25 +16,23 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from probe2road.crs import WGS84, crs_to_text, parse_crs, transform, working_crs
+from probe2road.crs import WGS84, parse_crs, transform, working_crs
 from probe2road.errors import InputError
 from probe2road.graph.direction import (
     DIRECTION_TAGS,
     ONEWAY_TAGS,
-    driving_direction,
     in_driving_direction,
     tagged_direction,
     told_direction,
 )
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
-from probe2road.graph.tables import edges_with_turns
-from probe2road.io.atomic import atomic_path
-from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table, outgoing, text_value, typed_column
+from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table, typed_column
 from probe2road.io.guard import parsing
 from probe2road.io.osm_json import holds_osm_json, read_json_heights, read_json_ways
 from probe2road.io.osm_ways import OsmWays, osm_errors, placed_parts, read_heights, read_ways, split_at_shared_nodes
+from probe2road.io.osm_writer import GENERATOR, KEPT_TAGS, PREFIX
 
-__all__ = ["DRIVABLE", "read_osm", "write_osm"]
+__all__ = ["DRIVABLE", "read_osm"]
 
 logger = logging.getLogger(__name__)
 
@@ -60,11 +49,6 @@ DRIVABLE = frozenset(
     ]
 )  # values of the highway tag that cars drive on
 
-_KEPT_TAGS = ("highway", "oneway", "layer", "bridge", "tunnel", "lanes", "name")
-_PREFIX = "probe2road:"
-_GENERATOR = "probe2road; crs="
-_DECIMALS = 7  # of a degree, in every OSM file
-
 
 def read_osm(
     path: str | PathLike[str], *, target_crs: Any = None, highways: Collection[str] | None = DRIVABLE
@@ -74,7 +58,7 @@ def read_osm(
     Ways are split where they share a node, so that a bridge stays apart from the road below. Of a way that an extract
     cuts, the parts inside are kept; what an editor has marked for deletion is gone. Positions may stand at the nodes or
     at the ways (``out geom`` of Overpass), in XML, PBF or Overpass JSON. A file written
-    by `write_osm` comes back as the graph it was, to the 1 cm of the format.
+    by `probe2road.io.osm_writer.write_osm` comes back as the graph it was, to the 1 cm of the format.
 
     Parameters
     ----------
@@ -97,10 +81,6 @@ def read_osm(
     ------
     InputError
         If the file is damaged or holds no road of these classes.
-
-    See Also
-    --------
-    write_osm
     """
     json = holds_osm_json(path)
     recorded = None if json else _recorded_crs(path)
@@ -144,7 +124,7 @@ def _recorded_crs(path: str | PathLike[str]) -> CRS | None:
     """Return the metric CRS in the header of our own file, None for other files."""
     with osm_errors(path), osmium.io.Reader(str(path), osmium.osm.osm_entity_bits.NOTHING) as reader:
         generator = reader.header().get("generator")
-    return parse_crs(generator.removeprefix(_GENERATOR), where=path) if generator.startswith(_GENERATOR) else None
+    return parse_crs(generator.removeprefix(GENERATOR), where=path) if generator.startswith(GENERATOR) else None
 
 
 def _usable(ways: OsmWays) -> OsmWays:
@@ -171,8 +151,8 @@ def _split_at_junctions(ways: OsmWays, target: CRS, path: str | PathLike[str]) -
     """Cut ways at the nodes they share."""
     parts = split_at_shared_nodes(ways)
     lines = _lines(ways.select_vertices(parts.vertex), path, parts.part, target)
-    tags = ways.tag_table([*_KEPT_TAGS, *DIRECTION_TAGS])
-    kept = tags.reindex(columns=_KEPT_TAGS).assign(oneway=_oneway(tags))
+    tags = ways.tag_table([*KEPT_TAGS, *DIRECTION_TAGS])
+    kept = tags.reindex(columns=KEPT_TAGS).assign(oneway=_oneway(tags))
     kept.insert(0, "osmid", ways.ids)
     attributes = kept.iloc[ways.way[parts.vertex[parts.first]]]
     graph = graph_from_lines(lines, crs=target, origin="reference", snap=1e-6, attributes=attributes)
@@ -187,83 +167,14 @@ def _oneway(tags: pd.DataFrame) -> pd.Series:
 
 
 def _restored(ways: OsmWays, target: CRS, path: str | PathLike[str]) -> RoadGraph:
-    """Return the graph that `write_osm` wrote."""
+    """Return the graph that `probe2road.io.osm_writer.write_osm` wrote."""
     if not ways.placed.all():
         raise InputError("some nodes of its ways are missing", where=path, fix="write it again")
     lines = _lines(ways, path, ways.way, target)
-    keys = dict.fromkeys(key for tags in ways.tags for key in tags if key.startswith(_PREFIX))
-    ours = ways.tag_table(keys).rename(columns=lambda name: name.removeprefix(_PREFIX))
+    keys = dict.fromkeys(key for tags in ways.tags for key in tags if key.startswith(PREFIX))
+    ours = ways.tag_table(keys).rename(columns=lambda name: name.removeprefix(PREFIX))
     with parsing(path, "the tags of its ways are damaged", fix="write it again"):
         table = gpd.GeoDataFrame(ours.apply(typed_column), geometry=lines, crs=target)
     if not set(OWN_COLUMNS) <= set(table):
         table = table.reindex(columns=[*OWN_COLUMNS, "geometry"])
     return graph_from_edge_table(table, where=path)
-
-
-def write_osm(graph: RoadGraph, path: str | PathLike[str]) -> None:
-    """Write one way per edge to an OSM file, XML or PBF by suffix; edges share the node at a junction.
-
-    A way is tagged ``highway`` (``road``, the class of a road whose class is unknown, unless the edge says
-    otherwise), ``oneway=yes`` where it is one-way, ``source`` and our columns under their prefix. The metric CRS
-    is recorded in the header.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written or the graph holds private columns.
-    """
-    graph = outgoing(graph, where=path)
-    positions, node_lists = _numbered_nodes(graph)
-    tags = _way_tags(graph)
-    header = osmium.io.Header()
-    header.set("generator", f"{_GENERATOR}{crs_to_text(graph.crs)}")
-    with atomic_path(path) as temporary, _writer(temporary, header) as writer:
-        for number, (lon, lat, z) in enumerate(positions.tolist(), start=1):
-            height = {"ele": f"{z:.3f}"} if np.isfinite(z) else {}
-            writer.add_node(osmium.osm.mutable.Node(id=-number, version=1, location=(lon, lat), tags=height))
-        for number, (refs, pairs) in enumerate(zip(node_lists, tags, strict=True), start=1):
-            writer.add_way(osmium.osm.mutable.Way(id=-number, version=1, nodes=refs, tags=pairs))
-
-
-@contextmanager
-def _writer(path: Path, header: osmium.io.Header) -> Iterator[osmium.SimpleWriter]:
-    """Open a writer of osmium, and report a full disk as such."""
-    writer = osmium.SimpleWriter(str(path), header=header)
-    try:
-        yield writer
-        writer.close()
-    except RuntimeError:
-        # A writer that failed ends the process when it is taken down (osmium flushes it once more): it never is.
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(writer))
-        raise
-
-
-def _numbered_nodes(graph: RoadGraph) -> tuple[NDArray[np.float64], list[list[int]]]:
-    """Return positions ``(lon, lat, z)`` of shape ``(n, 3)``, junctions first, and the ids of every edge's nodes."""
-    coordinates, owner = shapely.get_coordinates(graph.edges.geometry.to_numpy(), include_z=True, return_index=True)
-    n_edges, used = len(graph.edges), np.unique(graph.edges[["u", "v"]])
-    heads = np.searchsorted(owner, np.arange(n_edges))
-    tails = np.searchsorted(owner, np.arange(n_edges), side="right") - 1
-    number = np.full(len(coordinates), -1)
-    for vertex, end in ((heads, "u"), (tails, "v")):
-        number[vertex] = np.searchsorted(used, graph.edges[end])
-    inner = np.flatnonzero(number < 0)
-    number[inner] = len(used) + np.arange(len(inner))
-    positions = np.zeros((len(used) + len(inner), 3))
-    positions[number[::-1]] = coordinates[::-1]  # the first end at a junction places it
-    positions[:, 2] = np.nan
-    np.fmax.at(positions[:, 2], number, coordinates[:, 2])  # and the highest gives its height
-    lon, lat = transform(positions[:, 0], positions[:, 1], graph.crs, WGS84)
-    rounded = np.column_stack([np.round(lon, _DECIMALS), np.round(lat, _DECIMALS), positions[:, 2]])
-    return rounded, [part.tolist() for part in np.split(-(number + 1), heads[1:])] if n_edges else []
-
-
-def _way_tags(graph: RoadGraph) -> list[dict[str, str]]:
-    """Return the tags of every edge."""
-    table = pd.DataFrame(edges_with_turns(graph.edges, graph.turns).drop(columns=["geometry", "length"]))
-    oneway = driving_direction(graph.edges).map({1: ONEWAY_TAGS[1]}).array
-    plain = {"highway": "road", **{name: table[name].array for name in _KEPT_TAGS if name in table}}
-    public = pd.DataFrame({**plain, "oneway": oneway, "source": "probe2road"}, index=table.index)
-    public["highway"] = public["highway"].fillna("road")
-    text = pd.concat([public, table.add_prefix(_PREFIX)], axis=1).astype(object).map(text_value)
-    return [{key: value for key, value in row.items() if isinstance(value, str)} for row in text.to_dict("records")]
