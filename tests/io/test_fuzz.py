@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import importlib
 import random
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # the worker, a process of its own, imports it by name
 INPUTS = 100
 
 fuzz: Any = importlib.import_module("fuzz")

@@ -34,7 +34,13 @@ from numpy.typing import NDArray
 from probe2road.bounds import Positive
 from probe2road.crs import WGS84, crs_to_text, transform
 from probe2road.errors import OptionError
-from probe2road.graph.direction import ONEWAY_TAGS, driving_direction
+from probe2road.graph.direction import (
+    ONEWAY_TAGS,
+    DirectionOptions,
+    counted_direction,
+    driving_direction,
+    told_direction,
+)
 from probe2road.graph.levels import crossing_layers
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import edges_with_turns
@@ -180,13 +186,21 @@ def _way_tags(graph: RoadGraph, *, router: bool) -> list[dict[str, str]]:
     """Return the tags of every edge."""
     table = pd.DataFrame(edges_with_turns(graph.edges, graph.turns).drop(columns=["geometry", "length"]))
     unknown = _UNKNOWN_CLASS["router" if router else "editor"]
-    oneway = driving_direction(graph.edges).map({1: ONEWAY_TAGS[1]}).array
+    way = _probable_direction(graph.edges) if router else driving_direction(graph.edges)
+    oneway = way.map({1: ONEWAY_TAGS[1], -1: ONEWAY_TAGS[-1]}).array
     plain = {"highway": unknown, **(_seen_tags(graph) if router else {})}
     kept = {name: table[name].array for name in KEPT_TAGS if name in table}
     public = pd.DataFrame({**plain, **kept, "oneway": oneway, "source": "probe2road"}, index=table.index)
     public["highway"] = public["highway"].fillna(unknown)
     text = pd.concat([public, table.add_prefix(PREFIX)], axis=1).astype(object).map(text_value)
     return [{key: value for key, value in row.items() if isinstance(value, str)} for row in text.to_dict("records")]
+
+
+def _probable_direction(edges: pd.DataFrame) -> pd.Series:
+    """Return the driving direction of each edge, the more probable one where too few drives were seen to be sure."""
+    counted = counted_direction(edges, options=DirectionOptions(min_confidence=0.5))
+    told = told_direction(edges["oneway"]) if "oneway" in edges else pd.Series(pd.NA, edges.index, dtype="Int64")
+    return told.fillna(counted).fillna(0).astype("int64")
 
 
 def _seen_tags(graph: RoadGraph) -> dict[str, NDArray[np.object_]]:
