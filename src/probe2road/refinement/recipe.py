@@ -27,6 +27,7 @@ from probe2road.refinement.junctions.braids import BraidOptions, open_braids
 from probe2road.refinement.junctions.forks import ForkOptions, move_forks
 from probe2road.refinement.junctions.passages import passing_positions
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
+from probe2road.refinement.strays import StrayOptions, drop_strays
 from probe2road.refinement.undriven import RungOptions, drop_undriven
 from probe2road.run.progress import Progress, silent
 from probe2road.run.stages import GAPS_FILLED, Stage
@@ -49,6 +50,7 @@ class RefineOptions:
     rungs: RungOptions = field(default_factory=RungOptions)  # which edges need more than min_support
     junctions: DisambiguateOptions = field(default_factory=DisambiguateOptions)  # which junctions are split
     braids: BraidOptions = field(default_factory=BraidOptions)  # which chains of edges are roads side by side
+    strays: StrayOptions = field(default_factory=StrayOptions)  # which dead ends are errors of positions
     forks: ForkOptions = field(default_factory=ForkOptions)  # which forks are moved to where traces part
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)  # what counts as having driven an edge
     move: bool | None = None  # whether edges move to the middle of what was driven; None: see `settled`
@@ -132,6 +134,11 @@ def _open_braids(at: _Stand) -> RoadGraph:
     return open_braids(at.graph, at.matches.steps, options=at.options.braids)
 
 
+def _drop_strays(at: _Stand) -> RoadGraph:
+    kept = drop_strays(at.graph, at.fleet, at.matches, options=at.options.strays)
+    return kept if kept is at.graph else clean_graph(kept, options=at.clean)
+
+
 def _move_forks(at: _Stand) -> RoadGraph:
     return move_forks(at.graph, at.fleet, at.matches, options=at.options.forks)
 
@@ -155,6 +162,7 @@ _STEPS = (
     _Step("split junctions again", _split_junctions),
     _Step("drop undriven edges again", _drop_undriven, follows=True),
     _Step("open braids", _open_braids),
+    _Step("drop strays", _drop_strays),
     _Step("move forks", _move_forks),
     _Step("add evidence", _add_evidence, keeps_roads=True),
     _Step("move edges", _move_edges, keeps_roads=True),
