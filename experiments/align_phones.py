@@ -5,8 +5,8 @@
 FOLDER holds drives.parquet and drives.points.parquet of the UAH-DriveSet: 40 drives of six cars, a fix a second,
 markings of the own lane, no boundaries, on a motorway and on a road with a lane for each direction. There is no
 reference; the drives are compared with each other. Every 25 m of each direction, the place at which each drive crosses
-is measured from the mean of all, where five drives or more pass. Prints, for each road: the median of that distance, the
-root mean square, the share beyond 1.75 m (half a lane) and beyond 5 m, and the number of crossings. Drives of the
+is measured from the mean of all, where five drives or more pass. Prints, for each road: the median of that distance,
+the root mean square, the share beyond 1.75 m (half a lane) and beyond 5 m, and the number of crossings. Drives of the
 motorway use several lanes, so that some of their spread is true; those of the other road use one.
 
 `--aligned` measures a file that `probe2road align` wrote in place of aligning.

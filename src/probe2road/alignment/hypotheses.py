@@ -5,9 +5,10 @@ Strategy
 The score of a hypothesis is the log-likelihood of a Poisson process: the rate at which something is seen at each offset
 is that at which other drives saw it, given how far to the side they could see. Where nobody could see yet it is the
 rate at which the drive itself saw it a little before and after, so a drive in a lane of its own extends the map; it is
-not pulled to where all its lines would match lines. And what should be seen and is not counts against a hypothesis, so
-a drive is not put beside a guard rail that it did not see. GNSS adds its own term, which is small at one keyframe
-because its error is the same at the next.
+not pulled to where all its lines would match lines. That asks for cameras that see other lanes: one that sees its own
+alone finds beside the road, where nobody looked, always what it expects. The less is seen of other lanes, the less is
+new. And what should be seen and is not counts against a hypothesis, so a drive is not put beside a guard rail that it
+did not see. GNSS adds its own term, which is small at one keyframe because its error is the same at the next.
 """
 
 from __future__ import annotations
