@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from probe2road.alignment.hypotheses import Track
-from probe2road.alignment.profiles import RoadPlaces, ShiftSearch
+from probe2road.alignment.hypotheses import Track, own_rates
+from probe2road.alignment.profiles import RoadPlaces, ShiftSearch, Sights, average_view, empty_profiles
 from probe2road.alignment.registration import Chains, DriveEvidence, register
 
 PLACES = RoadPlaces.from_roads(np.zeros(10, np.int64))
@@ -44,3 +44,23 @@ def test_held_drives_stay_and_the_others_come_to_them(settled: bool) -> None:
     assert shifts([0.0, 0.0, 3.5], settled=settled, held=[False, False, True]) == pytest.approx(
         [3.5, 3.5, 0.0], abs=0.3
     )
+
+
+@pytest.mark.parametrize(("lines", "new"), [((-1.75, 1.75), False), ((-5.25, -1.75, 1.75, 5.25), True)])
+def test_only_who_sees_other_lanes_knows_a_new_one(lines: tuple[float, ...], new: bool) -> None:
+    """Beside the road, where nobody looked, a drive expects its own lines only if cameras see more than one lane."""
+    search = ShiftSearch(9.0, 0.25, 29.0, 0.3, 0.7, 0.25)
+    keyframe = np.repeat(np.arange(20), len(lines))
+    value = np.tile(lines, 20)
+    sights = Sights(
+        np.arange(21) * len(lines), np.zeros(len(value), np.int64), value, np.zeros(len(value), np.int8)
+    )  # fmt: skip
+    own = np.zeros(20)
+    profiles = empty_profiles(
+        RoadPlaces.from_roads(np.zeros(1, np.int64)), average_view(sights, keyframe, own, search), search
+    )  # fmt: skip
+    track = Track(np.zeros(20, np.int64), own, own, np.full(20, 0.1), np.full(20, 10.0))
+    rate = own_rates(0, 20, sights, track, profiles, search)[10, 0]
+    at_line = rate[round((1.75 + search.half_width) / search.bin)]
+    assert (at_line > 2.0) == new
+    assert at_line >= 1.0

@@ -14,10 +14,6 @@ def still(traces: pd.DataFrame) -> pd.DataFrame:
     return traces.assign(x=traces["x"].iloc[0], y=traces["y"].iloc[0])
 
 
-def jumping(traces: pd.DataFrame) -> pd.DataFrame:
-    return traces.assign(y=traces["y"] + np.where(np.arange(len(traces)) < 50, 0.0, 300.0))
-
-
 def mirrored(traces: pd.DataFrame) -> pd.DataFrame:
     return traces.assign(x=2.0 * traces["x"].mean() - traces["x"])
 
@@ -36,7 +32,6 @@ def two_in_one(traces: pd.DataFrame) -> pd.DataFrame:
     ("spoil", "reason"),
     [
         (still, "does not move"),
-        (jumping, "the position jumps"),
         (mirrored, "heading contradicts the course"),
         (slow_clock, "time and speed contradict the distance"),
         (two_in_one, "jumps to and fro: two drives with one id?"),

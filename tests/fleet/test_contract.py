@@ -11,6 +11,7 @@ from pyproj import CRS
 
 from probe2road.errors import CRSError, InputError, OptionError
 from probe2road.fleet.contract import TraceGaps, fleet_from_tables, trace_breaks
+from probe2road.fleet.jumps import position_jumps
 from sketches import UTM
 
 
@@ -233,3 +234,27 @@ def test_what_was_found_in_a_fleet_does_not_travel_with_it() -> None:
     empty = replace(fleet, traces=fleet.traces.iloc[:0])
     assert (empty.owner.tolist(), empty.ids.tolist()) == ([], [])
     assert set(vars(pickle.loads(pickle.dumps(fleet)))) == {"traces", "points", "crs"}
+
+
+@pytest.mark.parametrize(
+    ("repeats", "jumps"),
+    [
+        (1, []),  # the receiver had no new position once; the next step covers two seconds
+        (3, []),
+        (10, [11]),  # the vehicle stood
+    ],
+)
+def test_a_repeated_position_is_stale_for_a_while_and_no_jump_follows(repeats: int, jumps: list[int]) -> None:
+    x = np.concatenate([[0.0], np.full(repeats, 0.0), 39.0 * np.arange(repeats + 1, repeats + 4)])
+    if jumps:
+        x[repeats + 1 :] += 100.0 - x[repeats + 1]
+    table = pd.DataFrame({"trace_id": 1, "t": range(len(x)), "x": x, "y": 0.0})
+    fleet = fleet_from_tables(table, crs=UTM, keep_crs=True)
+    assert np.flatnonzero(position_jumps(fleet)).tolist() == jumps
+    assert np.flatnonzero(trace_breaks(fleet, TraceGaps(max_step=1e4))).tolist() == [0, *jumps]
+
+
+def test_without_a_clock_a_long_step_is_a_jump() -> None:
+    table = pd.DataFrame({"trace_id": [1, 1, 1, 1, 2], "x": [0.0, 100.0, 200.0, 700.0, 9000.0], "y": 0.0})
+    fleet = fleet_from_tables(table, crs=UTM, keep_crs=True)
+    assert np.flatnonzero(position_jumps(fleet)).tolist() == [3]

@@ -10,7 +10,8 @@ import pytest
 from pyproj import CRS
 
 from probe2road.errors import InputError
-from probe2road.fleet.contract import fleet_from_tables, stray_fixes
+from probe2road.fleet.contract import fleet_from_tables
+from probe2road.fleet.jumps import stray_fixes
 from probe2road.fleet.outliers import OutlierOptions, impossible_fixes, main_area
 from probe2road.io.describe import describe_fleet
 

@@ -14,6 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.alignment.options import AlignOptions
+from probe2road.alignment.parts import cut_at_jumps, without_false_starts
 from probe2road.alignment.reckoning import steadying
 from probe2road.alignment.report import AlignmentReport, make_report
 from probe2road.alignment.screening import screen_drives
@@ -81,8 +82,10 @@ def align(
     Returns
     -------
     Alignment
-        The same rows with moved poses, and points moved rigidly with the pose that they were seen from. Drives that
-        cannot be aligned are where they were, or left out with ``keep_rejected=False``; the report names them.
+        The same rows with moved poses, and points moved rigidly with the pose that they were seen from. Fixes at the
+        start of a drive, from before the receiver had a position, are left out. A drive that jumps is cut, and the
+        parts of drive 7 are called 7/0, 7/1 and so on. Drives that cannot be aligned are where they were, or left out
+        with ``keep_rejected=False``; the report names them.
 
     Raises
     ------
@@ -161,12 +164,14 @@ def _align(
         raise InputError("the fleet has no traces", where="align", fix="pass at least one drive")
     if workers < 1:
         raise OptionError(f"workers is {workers}", where="align", fix="use 1 or more")
+    fleet = without_false_starts(fleet, ~held)
     reasons = np.where(held, "", screen_drives(fleet))
-    usable = reasons == ""
-    touched = (usable & ~held)[fleet.owner]
+    touched = ((reasons == "") & ~held)[fleet.owner]
     steady = np.zeros((len(touched), 4))
     steady[touched, :2] = steadying(fleet)[touched]
-    fleet = moved_fleet(fleet, steady)
+    fleet, drive = cut_at_jumps(moved_fleet(fleet, steady), (reasons == "") & ~held)
+    reasons, held = reasons[drive], held[drive]
+    usable = reasons == ""
     tiles = find_tiles(fleet, options, touched=touched if held.any() else None)
     with open_workspace(folder, fleet, _Run(options, int(held.sum()))) as work:
         moves = align_tiles(

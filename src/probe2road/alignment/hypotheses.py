@@ -5,9 +5,10 @@ Strategy
 The score of a hypothesis is the log-likelihood of a Poisson process: the rate at which something is seen at each offset
 is that at which other drives saw it, given how far to the side they could see. Where nobody could see yet it is the
 rate at which the drive itself saw it a little before and after, so a drive in a lane of its own extends the map; it is
-not pulled to where all its lines would match lines. And what should be seen and is not counts against a hypothesis, so
-a drive is not put beside a guard rail that it did not see. GNSS adds its own term, which is small at one keyframe
-because its error is the same at the next.
+not pulled to where all its lines would match lines. That asks for cameras that see other lanes: one that sees its own
+alone finds beside the road, where nobody looked, always what it expects. The less is seen of other lanes, the less is
+new. And what should be seen and is not counts against a hypothesis, so a drive is not put beside a guard rail that it
+did not see. GNSS adds its own term, which is small at one keyframe because its error is the same at the next.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ _OUTLIERS = 0.05  # least rate of anything anywhere, as a share of the average
 _OWN_WINDOW = 8  # keyframes before and after that say what a drive sees all along
 _NOVELTY = 0.95  # weight of what the drive itself saw, against the average, where nobody could see yet
 _OWN_DOUBT = 0.3  # keyframes whose average view they are mixed with
+_OWN_LANE = 5.5  # m to either side; what is seen further away, smoothed as views are, belongs to other lanes
+_WIDE = 0.03  # share of a view in other lanes, from which a camera tells a lane of its own from those of others
 
 
 class Track(NamedTuple):
@@ -126,7 +129,7 @@ def own_rates(
 ) -> NDArray[np.float32]:
     """Return how often a chain sees something at each offset around each keyframe (left out), relative to the average.
 
-    Shape ``(end - begin, kinds, bins)``.
+    Shape ``(end - begin, kinds, bins)``; the less of other lanes is seen, the nearer to 1.
     """
     view = profiles.average
     kinds, n_bins = view.shape
@@ -143,12 +146,22 @@ def own_rates(
     rates = np.empty((end - begin, kinds, n_bins), np.float32)
     for which in range(kinds):
         doubt = _OWN_DOUBT * view[which].max()
+        novelty = _NOVELTY * min(_share_of_other_lanes(view[which], search) / _WIDE, 1.0)
         for b in range(n_bins):
             others_seen, others_could = _around(seen[:, which, b]), _around(could[:, which, b])
             for i in range(end - begin):
                 own_rate = (max(others_seen[i], 0.0) + doubt) / (max(others_could[i], 0.0) + doubt)
-                rates[i, which, b] = _NOVELTY * own_rate + 1.0 - _NOVELTY
+                rates[i, which, b] = novelty * own_rate + 1.0 - novelty
     return rates
+
+
+@njit(cache=True)
+def _share_of_other_lanes(view: NDArray[np.float64], search: ShiftSearch) -> float:
+    """Return the share of a view, shape ``(bins,)``, that lies further to the side than the lane of the vehicle."""
+    reach = int(_OWN_LANE / search.bin)
+    middle = len(view) // 2
+    near = view[max(middle - reach, 0) : middle + reach + 1].sum()
+    return 1.0 - near / max(view.sum(), 1e-9)
 
 
 @njit(cache=True)

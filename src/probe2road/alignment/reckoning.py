@@ -166,7 +166,10 @@ def _fitted(
 def _running_median(
     values: NDArray[np.float64], seconds: NDArray[np.float64], chain: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the median of each column (n, 2) over the fixes of the same chain that are near in time."""
+    """Return the median of each column (n, 2) over the fixes of the same chain that are near in time.
+
+    Of two values in the middle it is the upper one, not their mean: no fix is put half way across a jump.
+    """
     n = len(values)
     result = np.empty_like(values)
     first = 0
@@ -181,5 +184,6 @@ def _running_median(
         # Fixes are counted from this fix, so that both sides have the same weight.
         begin = i - (i - first) // stride * stride
         for column in range(2):
-            result[i, column] = np.median(values[begin:last:stride, column])
+            window = np.sort(values[begin:last:stride, column])
+            result[i, column] = window[len(window) // 2]
     return result

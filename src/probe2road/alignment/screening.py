@@ -13,6 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.fleet.contract import Fleet, fix_intervals
+from probe2road.fleet.jumps import position_jumps
 
 __all__ = ["rows_of_points", "screen_drives"]
 
@@ -22,8 +23,6 @@ _SAME_TIME = 0.6  # s; a point belongs to the fix nearest in time, if that is no
 _LEAST_DRIVEN = 30.0  # m from end to end; a shorter drive shows no road
 _MOVED = 3.0  # m; the course of a shorter step is noise
 _ROLLED = 1.0  # m; in a shorter step, the vehicle may stand
-_JUMP = 150.0  # m by which a jump is longer than the speed explains
-_TOP_SPEED = 70.0  # m/s, where no speed is recorded
 _JUMPY = 0.1  # share of jumps in the steps, from which a trace is a mix of two drives
 _COURSE = 40.0  # degrees, largest median angle between heading and course
 _CLOCK = 1.6  # largest factor between distance and speed times time
@@ -59,15 +58,14 @@ def screen_drives(fleet: Fleet) -> NDArray[np.str_]:
     step[starts[:-1]] = np.nan
     interval = fix_intervals(traces["t"])
     speed = traces["speed"].to_numpy(np.float64) if "speed" in traces else np.full(len(step), np.nan)
-    jump = _jumps(step, interval, speed)
-    jumps, steps = _sum(jump, owner, fleet.n_traces), np.maximum(np.diff(starts) - 1, 1)
+    jumps = np.bincount(owner[position_jumps(fleet)], minlength=fleet.n_traces)
+    steps = np.maximum(np.diff(starts) - 1, 1)
 
     box = traces.groupby(owner)[["x", "y"]]
     extent = np.hypot(*(box.max() - box.min()).to_numpy().T)
     checks = (
         ("does not move", extent < _LEAST_DRIVEN),
         ("jumps to and fro: two drives with one id?", jumps > _JUMPY * steps),
-        ("the position jumps", jumps > 0),
         ("time and speed contradict the distance", _clock_is_wrong(step, interval, speed, owner)),
         ("heading contradicts the course", _course_is_wrong(traces, dx, dy, step, owner)),
         ("points do not belong to the fixes", _points_are_wrong(fleet)),
@@ -110,14 +108,6 @@ def rows_of_points(fleet: Fleet) -> NDArray[np.int64]:
     close = np.abs(key[nearest] - wanted) <= _SAME_TIME * 1000.0
     found[usable[close]] = rows[nearest[close]]
     return found
-
-
-def _jumps(step: NDArray[np.float64], interval: NDArray[np.float64], speed: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which steps are longer than any vehicle can drive."""
-    before = np.concatenate([speed[:1], speed[:-1]])
-    fastest = np.where(np.isfinite(speed + before), 2.0 * np.maximum(speed, before), _TOP_SPEED)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(step > fastest * np.where(np.isfinite(interval), interval, 10.0) + _JUMP, bool)
 
 
 def _clock_is_wrong(
@@ -168,10 +158,6 @@ def _points_are_wrong(fleet: Fleet) -> NDArray[np.bool_]:
 
 def _milliseconds(times: pd.Series) -> NDArray[np.int64]:
     return times.to_numpy(dtype="datetime64[ms]").astype(np.int64)
-
-
-def _sum(values: NDArray[np.bool_], owner: NDArray[np.int64], n: int) -> NDArray[np.float64]:
-    return np.asarray(np.bincount(owner, weights=values, minlength=n), np.float64)
 
 
 def _median(values: NDArray[np.float64], owner: NDArray[np.int64]) -> NDArray[np.float64]:

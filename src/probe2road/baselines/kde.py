@@ -14,7 +14,8 @@ from probe2road.baselines.volume import count_voxels, dense_pillars
 from probe2road.baselines.volume_graph import graph_from_volume
 from probe2road.baselines.volume_skeleton import thin_volume
 from probe2road.bounds import NotNegative, Positive
-from probe2road.fleet.contract import Fleet, TraceGaps, without_strays
+from probe2road.fleet.contract import Fleet, TraceGaps
+from probe2road.fleet.jumps import without_strays
 from probe2road.graph.clean import CleanOptions, clean_graph
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.options import checked

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -40,14 +39,12 @@ __all__ = [
     "fix_intervals",
     "fleet_from_checked",
     "fleet_from_tables",
-    "stray_fixes",
+    "step_seconds",
+    "times_left",
     "trace_breaks",
-    "without_strays",
 ]
 
 logger = logging.getLogger(__name__)
-
-_MOST_STRAYS = 3  # fixes in a row that a trace goes past
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,99 +201,34 @@ def trace_breaks(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool
     with np.errstate(invalid="ignore"):
         late = (interval > interval_limit[owner]) & (step > gaps.standing_step)
         breaks |= within & (late | (step > step_limit[owner]))
-        breaks |= within & (step > gaps.max_speed * np.maximum(interval, 1.0))
+        breaks |= within & (step > gaps.max_speed * np.maximum(step_seconds(fleet, gaps), 1.0))
     return breaks
 
 
-def stray_fixes(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool_]:
-    """Mark fixes inside a trace that no vehicle can have driven to and back from, between fixes that agree.
+def times_left(fleet: Fleet, gaps: TraceGaps) -> NDArray[np.datetime64]:
+    """Return when the vehicle was last known to be where each fix has it: shape ``(n_fixes,)``, NaT without clock.
 
-    A receiver that sees a reflection jumps aside for a fix or two and comes back. The trace goes on from before to
-    behind as if they were not there. At most a third of a trace is marked; where it would be more, its id stands for
-    two vehicles, and none is.
-
-    Parameters
-    ----------
-    fleet
-        The fleet.
-    gaps
-        What is a jump: a step faster than ``max_speed``, or without clock longer than the trace's longest step.
-
-    Returns
-    -------
-    ndarray of bool, shape (n_fixes,)
-
-    Examples
-    --------
-    >>> table = pd.DataFrame({"trace_id": 1, "t": range(5), "x": [0.0, 9, 18, 27, 36], "y": [0.0, 0, 400, 0, 0]})
-    >>> fleet = fleet_from_tables(table, crs="EPSG:32616", keep_crs=True)
-    >>> stray_fixes(fleet).tolist()
-    [False, False, True, False, False]
+    A receiver that has no new position repeats the last one, and the next step covers the time of both. What is
+    repeated for longer than ``max_interval`` stands, and leaves when it was reported last.
     """
-    gaps = gaps or TraceGaps()
-    stray = np.zeros(len(fleet.traces), bool)
     x, y = (fleet.traces[axis].to_numpy() for axis in "xy")
     time = fleet.traces["t"].to_numpy(dtype="datetime64[ns]")
-    starts = fleet.starts
-
-    def is_jump(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Tell whether no vehicle can have driven from the one fix to the other."""
-        step = np.hypot(x[second] - x[first], y[second] - y[first])
-        seconds = (time[second] - time[first]) / np.timedelta64(1, "s")
-        with np.errstate(invalid="ignore"):
-            return np.where(np.isnan(seconds), step > gaps.max_step, step > gaps.max_speed * np.maximum(seconds, 1.0))
-
-    inside = np.arange(1, len(x))
-    inside = inside[fleet.owner[1:] == fleet.owner[:-1]]
-    jumps = np.zeros(len(x) + 1, bool)
-    jumps[inside] = is_jump(inside - 1, inside)
-    owners = fleet.owner[np.flatnonzero(jumps)]
-    for trace in np.unique(owners):
-        first, stop = int(starts[trace]), int(starts[trace + 1])
-        found = _strays_of_trace(jumps, first, stop, is_jump)
-        if 3 * len(found) <= stop - first and not _is_coarse(x, y, time, first, stop, gaps):
-            stray[found] = True
-    return stray
+    new = np.ones(len(x), bool)
+    new[1:] = (x[1:] != x[:-1]) | (y[1:] != y[:-1])
+    new[fleet.starts[:-1]] = True
+    reported = time[np.maximum.accumulate(np.where(new, np.arange(len(x)), 0))]
+    return np.where((time - reported) / np.timedelta64(1, "s") <= gaps.max_interval, reported, time)
 
 
-def without_strays(fleet: Fleet, gaps: TraceGaps | None = None, *, silent: bool = False) -> Fleet:
-    """Return the fleet without its `stray_fixes`, with a warning; the same fleet where there are none."""
-    stray = stray_fixes(fleet, gaps)
-    if not stray.any():
-        return fleet
-    if not silent:
-        logger.warning("left out %d of %d fixes that jump aside and back", int(stray.sum()), len(stray))
-    return replace(fleet, traces=fleet.traces[~stray].reset_index(drop=True))
+def step_seconds(fleet: Fleet, gaps: TraceGaps) -> NDArray[np.float64]:
+    """Return the seconds in which each step was driven, also across traces; NaN for the first row or without clock.
 
-
-def _strays_of_trace(
-    jumps: NDArray[np.bool_],
-    first: int,
-    stop: int,
-    is_jump: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]],
-) -> list[int]:
-    """Return the fixes of short runs between two jumps whose ends could have been driven past them."""
-    found: list[int] = []
-    here = first
-    while here + 1 < stop:
-        behind = here + 1
-        if jumps[here + 1]:
-            for back in range(here + 2, min(here + 2 + _MOST_STRAYS, stop)):
-                if jumps[back]:
-                    if not is_jump(np.array([here]), np.array([back]))[0]:
-                        found += range(here + 1, back)
-                        behind = back
-                    break
-        here = behind
-    return found
-
-
-def _is_coarse(
-    x: NDArray[np.float64], y: NDArray[np.float64], time: NDArray[Any], first: int, stop: int, gaps: TraceGaps
-) -> bool:
-    """Tell whether a trace without a clock has so long steps that a long step is not a jump."""
-    step = np.hypot(np.diff(x[first:stop]), np.diff(y[first:stop]))
-    return bool(np.isnat(time[first]) and gaps.step_factor * np.median(step) > gaps.max_step)
+    See `times_left` for how they differ from `fix_intervals`.
+    """
+    time, left = fleet.traces["t"].to_numpy(dtype="datetime64[ns]"), times_left(fleet, gaps)
+    seconds = np.full(len(time), np.nan)
+    seconds[1:] = (time[1:] - left[:-1]) / np.timedelta64(1, "s")
+    return seconds
 
 
 def fleet_from_tables(

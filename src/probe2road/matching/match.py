@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from probe2road.bounds import OneOf, Positive
 from probe2road.crs import extent_in_degrees, require_metric, require_same_crs
-from probe2road.fleet.contract import Fleet, stray_fixes
+from probe2road.fleet.contract import Fleet
+from probe2road.fleet.jumps import stray_fixes
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import TURN_DTYPES
 from probe2road.matching.chains import Paths, match_over_routes

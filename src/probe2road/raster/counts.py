@@ -20,7 +20,8 @@ from scipy import ndimage
 
 from probe2road.crs import require_same_crs
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks, without_strays
+from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
+from probe2road.fleet.jumps import without_strays
 from probe2road.raster.drawing import draw_line
 from probe2road.raster.grid import Grid, Window, sparse_zeros
 

@@ -18,7 +18,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks, without_strays
+from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
+from probe2road.fleet.jumps import without_strays
 from probe2road.raster.grid import Grid
 
 __all__ = ["estimate_bandwidth", "lateral_spread"]

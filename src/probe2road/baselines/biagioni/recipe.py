@@ -21,7 +21,8 @@ from probe2road.baselines.biagioni.pruning import prune_segments
 from probe2road.baselines.biagioni.street_map import initial_map, straight_pieces
 from probe2road.baselines.biagioni.traversals import Runs, TripPositions, good_runs, match_pieces, observe_trips
 from probe2road.bounds import NotNegative, OneOf, Positive
-from probe2road.fleet.contract import Fleet, TraceGaps, without_strays
+from probe2road.fleet.contract import Fleet, TraceGaps
+from probe2road.fleet.jumps import without_strays
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.models import PublishedModel
 from probe2road.options import checked

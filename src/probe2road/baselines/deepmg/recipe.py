@@ -20,7 +20,8 @@ from probe2road.baselines.deepmg.traversals import MatcherOptions, count_travers
 from probe2road.baselines.deepmg.variants import VARIANTS, find_variant
 from probe2road.bounds import OneOf, Probability
 from probe2road.errors import MissingFileError, OptionError
-from probe2road.fleet.contract import Fleet, TraceGaps, without_strays
+from probe2road.fleet.contract import Fleet, TraceGaps
+from probe2road.fleet.jumps import without_strays
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.options import checked
 from probe2road.raster.counts import dense_grid
