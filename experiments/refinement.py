@@ -34,7 +34,7 @@ from probe2road.refinement.junctions.braids import open_braids
 from probe2road.refinement.junctions.forks import move_forks
 from probe2road.refinement.junctions.passages import passing_positions
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
-from probe2road.refinement.undriven import RungOptions, drop_undriven
+from probe2road.refinement.undriven import RungOptions, drop_faint, drop_undriven
 from probe2road.segmentation.options import SegmentationOptions
 
 CITIES = ("boston", "hannover", "tokyo_shibuya")
@@ -131,6 +131,8 @@ def rows(fleet: Fleet, segmenter: str, built: RoadGraph | None) -> list[Row]:
     note("braids opened", graph)
     graph = move_forks(graph, fleet, matches)
     note("forks moved", graph)
+    if segmenter == "network":
+        note("faint edges dropped", clean_graph(drop_faint(graph, match(graph, fleet).steps)))
     if segmenter == "density":
         matches = match(graph, fleet)
         note("centrelines moved", refine_centreline(add_evidence(graph, fleet, matches), fleet, matches))

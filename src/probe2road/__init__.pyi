@@ -85,6 +85,7 @@ from .refinement.junctions.split import DisambiguateOptions as DisambiguateOptio
 from .refinement.recipe import RefineOptions as RefineOptions
 from .refinement.recipe import refine as refine
 from .refinement.strays import StrayOptions as StrayOptions
+from .refinement.undriven import FaintOptions as FaintOptions
 from .refinement.undriven import RungOptions as RungOptions
 from .run.progress import Progress as Progress
 from .run.progress import progress_bar as progress_bar

@@ -47,7 +47,7 @@ def checked(kind: type[T]) -> type[T]:
     --------
     >>> from probe2road.graph.clean import CleanOptions
     >>> CleanOptions(dead_end=20)
-    CleanOptions(short_edge=15.0, max_ring=120.0, dead_end=20.0, component=15.0)
+    CleanOptions(short_edge=15.0, collapse='shape', max_shift=3.0, dead_end=20.0, component=15.0)
     >>> CleanOptions(dead_end=float("inf"))
     Traceback (most recent call last):
         ...
@@ -131,7 +131,7 @@ def options_from_table(table: Mapping[str, Any], kind: type[T], *, where: object
     >>> options_from_table({"deadend": 20}, CleanOptions, where="build.toml")
     Traceback (most recent call last):
         ...
-    probe2road.errors.OptionError: build.toml: there is no option 'deadend'; use short_edge, max_ring, ...
+    probe2road.errors.OptionError: build.toml: there is no option 'deadend'; use short_edge, collapse, ...
     """
     defaults = {field.name: _default(field) for field in fields(kind)}  # type: ignore[arg-type]  # a dataclass
     return _made(kind, {name: value for name, value in defaults.items() if value is not MISSING}, table, where)

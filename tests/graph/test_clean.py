@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -165,7 +166,7 @@ class TestCollapseShortEdges:
         assert after.length == pytest.approx(before.length, abs=10)
 
     def test_kinks_inside_the_circle_are_cut_off(self) -> None:
-        hooked = [*self.CROSS[:4], [(48, 3), (49, -2), (46, -3), (88, -40)]]
+        hooked = [*self.CROSS[:4], [(48, 3), (46, 1), (48, 1), (88, -40)]]
         line = vertices(collapse_short_edges(graph_of(*hooked)), 4)
         assert line[0] == (44, 3)
         assert len(line) == 3
@@ -185,18 +186,58 @@ class TestCollapseShortEdges:
     def test_clusters_grow_to_the_middle_of_all_their_junctions(self) -> None:
         arms = [[(x, 0), (x, 60)] for x in (0, 6, 13)]
         road = [[(-50, 0), (0, 0)], [(0, 0), (6, 0)], [(6, 0), (13, 0)], [(13, 0), (60, 0)]]
-        graph = collapse_short_edges(graph_of(*road, *arms))
+        graph = collapse_short_edges(graph_of(*road, *arms), max_shift=None)
         assert graph.degrees().max() == 5
         assert graph.nodes.geometry[graph.degrees().idxmax()].x == pytest.approx(19 / 3)
 
-    @pytest.mark.parametrize("radius", [6.0, 9.0, 15.0])
-    def test_roundabouts_survive(self, radius: float) -> None:
-        corner = [(radius * x, radius * y) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1))]
-        between = [(0.7 * radius * x, 0.7 * radius * y) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
-        ring = [[corner[i], between[i], corner[(i + 1) % 4]] for i in range(4)]
-        arms = [[(x, y), (9 * x, 9 * y)] for x, y in corner]
-        graph = graph_of(*ring, *arms)
+    @pytest.mark.parametrize("angle", [20.0, 30.0, 45.0])
+    def test_the_two_junctions_of_a_flat_crossing_become_one(self, angle: float) -> None:
+        """Two roads as a mask 3 m wide shows them: they are one line while they are less than 3 m apart."""
+        half = np.radians(angle) / 2
+        join = 1.5 / np.tan(half)  # m from the crossing to where they are
+        far = (80 * np.cos(half), 80 * np.sin(half))
+        arms = [[(x * join, 0), (x * far[0], y * far[1])] for x in (-1, 1) for y in (-1, 1)]
+        graph = collapse_short_edges(graph_of(*arms, [(-join, 0), (join, 0)]), max_length=25.0)
+        assert sorted(graph.degrees()) == [1, 1, 1, 1, 4]
+        assert shapely.get_coordinates(graph.nodes.geometry[graph.degrees() == 4])[0] == pytest.approx(0.0, abs=1e-9)
+
+    @pytest.mark.parametrize("apart", [10.0, 14.0, 20.0])
+    def test_crossing_dual_carriageways_keep_four_junctions(self, apart: float) -> None:
+        at = (0.0, apart)
+        inner = [[(x, 0), (x, apart)] for x in at] + [[(0, y), (apart, y)] for y in at]
+        outer = [[(x, y), (x, y + (80 if y else -80))] for x in at for y in at]
+        outer += [[(x, y), (x + (80 if x else -80), y)] for x in at for y in at]
+        graph = graph_of(*inner, *outer)
         assert collapse_short_edges(graph) is graph
+        assert len(clean_graph(graph).nodes) == len(graph.nodes)
+        assert len(collapse_short_edges(graph, max_length=25.0, max_shift=None).edges) < len(graph.edges)
+
+    @pytest.mark.parametrize(("diameter", "n_arms"), [(12.0, 3), (12.0, 4), (20.0, 5), (30.0, 6)])
+    def test_roundabouts_keep_their_ring_and_their_arms(self, diameter: float, n_arms: int) -> None:
+        angles = np.arange(n_arms) * 2 * np.pi / n_arms
+        circle = [
+            diameter / 2 * np.stack([np.cos(a), np.sin(a)], axis=-1)
+            for a in (np.linspace(*pair, 9) for pair in pairwise([*angles, 2 * np.pi]))
+        ]
+        arms = [[line[0], line[0] * 100 / diameter] for line in circle]
+        graph = graph_of(*circle, *arms)
+        assert clean_graph(graph) is graph
+
+    def test_two_close_arms_of_a_roundabout_become_one_and_the_ring_stays(self) -> None:
+        angles = np.radians([0, 12, 120, 240, 360])
+        circle = [
+            12 * np.stack([np.cos(a), np.sin(a)], axis=-1) for a in (np.linspace(*pair, 9) for pair in pairwise(angles))
+        ]
+        graph = collapse_short_edges(graph_of(*circle, *[[line[0], line[0] * 8] for line in circle]))
+        assert sorted(graph.degrees()) == [1, 1, 1, 1, 3, 3, 4]
+
+    def test_staggered_side_roads_stay_apart_where_a_collapse_would_bend_them(self) -> None:
+        def staggered(by: float) -> RoadGraph:
+            road = [[(-80, 0), (0, 0)], [(0, 0), (by, 0)], [(by, 0), (80, 0)]]
+            return graph_of(*road, [(0, 0), (0, 80)], [(by, 0), (by, -80)])
+
+        assert len(collapse_short_edges(staggered(5.0)).edges) == 4
+        assert len(collapse_short_edges(staggered(12.0)).edges) == 5
 
     def test_holes_of_the_mask_collapse_with_their_edges(self) -> None:
         lens = [[(0, 0), (4, 3), (8, 0)], [(0, 0), (4, -3), (8, 0)]]
@@ -207,9 +248,10 @@ class TestCollapseShortEdges:
     def test_short_side_of_a_block_leaves_a_loop(self) -> None:
         block = [(0, 0), (0, 90), (90, 90), (90, 0), (10, 0)]
         graph = graph_of([(-50, 0), (0, 0)], [(0, 0), (10, 0)], block, [(10, 0), (60, -50)])
-        collapsed = collapse_short_edges(graph)
+        collapsed = collapse_short_edges(graph, max_shift=None)
         assert (collapsed.edges["u"] == collapsed.edges["v"]).sum() == 1
         check_graph(collapsed)
+        assert collapse_short_edges(graph) is graph
 
     def test_heights_stay_with_their_roads(self) -> None:
         lifted = [[(x, y, 7.0) for x, y in line] for line in self.CROSS]

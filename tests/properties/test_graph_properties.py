@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from probe2road.graph.check import check_graph
-from probe2road.graph.clean import CleanOptions, clean_graph, merge_degree_two_nodes
+from probe2road.graph.clean import CleanOptions, clean_graph, collapse_short_edges, merge_degree_two_nodes
 from probe2road.graph.roadgraph import RoadGraph, graph_from_lines
 from probe2road.raster.counts import Grid
 from probe2road.vectorize.lines import VectorizeOptions, vectorize
@@ -115,6 +115,19 @@ def test_cleaning_twice_changes_nothing(graph: RoadGraph, limit: float) -> None:
     assert degree[degree == 2].index.isin(loops).all()
     tips = clean.edges["u"].map(degree).eq(1) | clean.edges["v"].map(degree).eq(1)
     assert (clean.edges.loc[tips, "length"] >= limit).all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(graphs(), st.sampled_from([0.5, 3.0, 8.0]))
+def test_no_collapse_moves_a_line_by_more_than_it_may(graph: RoadGraph, limit: float) -> None:
+    """Each round collapses edges that share no node; the lines after it are compared with those before."""
+    before, after = graph, collapse_short_edges(graph, max_length=15.0, max_shift=limit)
+    rounds = len(before.nodes) - len(after.nodes)
+    old, new = (shapely.union_all(part.edges.geometry.to_numpy()) for part in (merge_degree_two_nodes(before), after))
+    if not new.is_empty and rounds:
+        assert shapely.hausdorff_distance(shapely.segmentize(old, 0.5), shapely.segmentize(new, 0.5)) <= rounds * (
+            limit + 0.5
+        )
 
 
 @settings(max_examples=25, deadline=None)

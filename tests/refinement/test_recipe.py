@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pandas as pd
 import pytest
 import shapely
 
@@ -52,3 +53,15 @@ def test_one_way_edges_run_in_their_driving_direction() -> None:
     assert edges[["u", "v", "forward", "backward"]].to_numpy().tolist() == [[1, 0, 12, 0], [3, 2, 12, 0], [4, 5, 12, 0]]
     first, last = (shapely.get_coordinates(shapely.get_point(edges.geometry.to_numpy(), end)) for end in (0, -1))
     assert (last - first).sum(axis=1) == pytest.approx([700, 600, 600], abs=1.0)
+
+
+def test_faint_edges_go_at_last_where_a_network_drew_the_mask_of_a_fleet_with_cameras() -> None:
+    graph = graph_of([(-200, 0), (0, 0)], [(0, 0), (200, 0)], [(0, 0), (0, 200)])
+    through, aside = spaced((-190, 0), (190, 0)), spaced((-190, 0), (0, 0), (0, 190))
+    seen = pd.DataFrame({"trace_id": 0, "x": [0.0], "y": 2.0, "z": 0.0, "kind": "lane_marking"})
+    fleet = fleet_of(*[through] * 20, *[aside] * 2, points=seen)
+    assert len(refine(graph, fleet, learned=True).edges) == 1
+    assert len(refine(graph, fleet, learned=False).edges) == 3
+    assert len(refine(graph, fleet, learned=True, options=RefineOptions(min_support=0)).edges) == 3
+    assert len(refine(graph, fleet_of(*[through] * 20, *[aside] * 2), learned=True).edges) == 3
+    assert len(refine(graph, fleet_of(through, through, aside, points=seen), learned=True).edges) == 3

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import geopandas as gpd
 import numpy as np
@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from probe2road.bounds import NotNegative
+from probe2road.bounds import NotNegative, OneOf
 from probe2road.errors import OptionError
+from probe2road.graph.contraction import contract_short_edges
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import finish_edges
-from probe2road.graph.topology import Topology, chains, contract_short_edges, joined_lines, mates
+from probe2road.graph.topology import Topology, chains, joined_lines, mates
 from probe2road.options import checked
 
 __all__ = [
@@ -48,8 +49,9 @@ _STRENGTH = {"segmentation": 0, "reference": 1, "gap": 2}  # a chain takes the o
 class CleanOptions:
     """Which parts of a graph count as flaws."""
 
-    short_edge: NotNegative[float] = 15.0  # m; edges between junctions up to this long are collapsed; 0 keeps all
-    max_ring: NotNegative[float] = 120.0  # m; rings with a perimeter of 2 short_edge up to this keep their edges
+    short_edge: NotNegative[float] = 15.0  # m; edges between junctions up to this long may collapse; 0 keeps all
+    collapse: Annotated[str, OneOf("shape", "length")] = "shape"  # those that keep the lines in place, or all
+    max_shift: NotNegative[float] = 3.0  # m by which a collapse that keeps them in place may move a line
     dead_end: NotNegative[float] = 15.0  # m; shorter dead ends and isolated edges are dropped; 0 keeps all
     component: NotNegative[float] = 15.0  # m; shorter components are dropped; 0 keeps all
 
@@ -88,12 +90,13 @@ def clean_graph(graph: RoadGraph, *, options: CleanOptions | None = None) -> Roa
     [99.0]
     """
     options = options or CleanOptions()
+    shift = options.max_shift if options.collapse == "shape" else None
     before, done = graph, None
     while done is not graph:
         done = graph
         graph = drop_small_components(graph, min_length=options.component)
         graph = drop_dead_ends(graph, min_length=options.dead_end)
-        graph = collapse_short_edges(graph, max_length=options.short_edge, max_ring=options.max_ring)
+        graph = collapse_short_edges(graph, max_length=options.short_edge, max_shift=shift)
         graph = merge_degree_two_nodes(graph)
     logger.info("cleaned %d edges (%.3f km) to %d", len(before.edges), before.length / 1000, len(graph.edges))
     return graph
@@ -208,24 +211,27 @@ def drop_dead_ends(graph: RoadGraph, *, min_length: float = 15.0) -> RoadGraph:
     return graph
 
 
-def collapse_short_edges(graph: RoadGraph, *, max_length: float = 15.0, max_ring: float = 120.0) -> RoadGraph:
+def collapse_short_edges(graph: RoadGraph, *, max_length: float = 15.0, max_shift: float | None = 3.0) -> RoadGraph:
     """Collapse edges of at most ``max_length`` (m) between two junctions, the shortest first, until none is left.
 
     Two junctions become one in the middle, weighted by the number of junctions that went into each. Around
     it, within one and a half times the distance of the two, the other edges become straight lines to it, which
     cuts off the hooks that thinning leaves there. Edges with a dead end are never collapsed, nor are loops.
 
-    A collapse may shrink a ring, but must not destroy a road: edges whose smallest ring is longer than ``2
-    max_length`` and at most ``max_ring`` stay, which keeps roundabouts, islands and small blocks as they are. On
-    a longer ring a short edge is a small part. A shorter ring is a hole in the mask, narrower than a road, and
-    collapses with its edges.
+    A collapse must not change the shape of the roads: an edge stays if its collapse would move any line by more than
+    ``max_shift``. Where two roads cross at a flat angle they lie beside the edge between their two junctions, and
+    hardly move. At a roundabout, at an island, or where the crossed road is two carriageways, they would. A small hole
+    in the mask collapses with the edges on both of its sides.
 
     Parameters
     ----------
     graph
         Any road graph; its nodes of degree 2 are merged first, for a short edge may be a chain.
-    max_length, max_ring
-        Metres; a ``max_length`` of 0 only merges.
+    max_length
+        Metres; 0 only merges.
+    max_shift
+        Metres by which one collapse may move lines: the Hausdorff distance, in either direction, of the lines within
+        its circle before and after. None collapses by length alone, as the paper does.
 
     Returns
     -------
@@ -241,7 +247,7 @@ def collapse_short_edges(graph: RoadGraph, *, max_length: float = 15.0, max_ring
     Notes
     -----
     METHOD 0.1 row 25 and 7.3: thinning leaves such edges where roads cross. Length alone cannot tell them from
-    real short links, so keep ``max_length`` low where traces are not consulted.
+    real short links.
 
     Examples
     --------
@@ -252,9 +258,10 @@ def collapse_short_edges(graph: RoadGraph, *, max_length: float = 15.0, max_ring
     POINT (42 3) 4
     """
     _require_length(max_length, "max_length")
-    _require_length(max_ring, "max_ring")
+    if max_shift is not None:
+        _require_length(max_shift, "max_shift")
     graph = merge_degree_two_nodes(graph)
-    network, stands_for = contract_short_edges(_network(graph), max_length=max_length, max_ring=max_ring)
+    network, stands_for = contract_short_edges(_network(graph), max_length=max_length, max_shift=max_shift)
     if len(network.edge) == len(graph.edges):
         return graph
     node = graph.nodes.index.to_numpy()

@@ -37,8 +37,8 @@ class StrayOptions:
 def drop_strays(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: StrayOptions | None = None) -> RoadGraph:
     """Remove dead ends that run beside a road that many more traces drove on, within the errors of positions there.
 
-    The spread of the fixes on the busy road says how far positions are off: tens of metres beside a street among tall buildings,
-    a few where vehicles have odometry. A service road that few drove on so stays where positions are good.
+    The spread of the fixes on the busy road says how far positions are off: tens of metres beside a street among tall
+    buildings, a few where vehicles have odometry. A service road that few drove on so stays where positions are good.
 
     Parameters
     ----------

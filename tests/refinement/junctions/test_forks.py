@@ -69,14 +69,31 @@ def test_the_branches_lead_straight_from_there_and_end_as_before() -> None:
     assert result.edges["length"].tolist() == pytest.approx([line.length for line in result.edges.geometry])
 
 
-def test_a_lane_that_leads_to_a_ramp_is_not_the_ramp() -> None:
-    """Those who leave change lanes from 40 m on and have one of their own from 80 m on; the ramp leaves at 120 m."""
-    x = np.arange(2.0, 400.0, 4.0)
-    away = np.interp(x, [40.0, 80.0, 120.0, 400.0], [0.0, -3.5, -3.5, -31.5])
+@pytest.mark.parametrize("on_lane", [80.0, 96.0])
+def test_a_lane_that_leads_to_a_ramp_is_not_the_ramp(on_lane: float) -> None:
+    """Those who leave change lanes from 0 m on, have one of their own for 40 or 24 m, and the ramp leaves at 120 m."""
+    x = np.arange(-194.0, 400.0, 4.0)
+    away = np.interp(x, [0.0, on_lane, 120.0, 400.0], [0.0, -3.5, -3.5, -31.5])
     fleet = fleet_of(*[np.stack([x, 0 * x], axis=1), np.stack([x, away], axis=1)] * 6)
-    graph = graph_of(*LATE)
+    graph = graph_of([(-200, 0), (SEEN, 0)], *LATE[1:])
     assert fork_of(moved(graph, fleet))[0] == pytest.approx(120.0, abs=8.0)
-    assert fork_of(moved(graph, fleet, max_lane=2.5))[0] < 90.0
+    assert fork_of(moved(graph, fleet, min_level=60.0, min_lane=4.0))[0] < 20.0
+
+
+def test_traces_that_swing_towards_a_ramp_which_begins_in_the_middle_of_the_road_part_where_they_begin_to() -> None:
+    """They keep a lane of 3.5 m on the right up to 100 m, cross to the middle, where the ramp is drawn, and leave."""
+    x = np.arange(2.0, 400.0, 4.0)
+    away = np.interp(x, [100.0, 125.0, 400.0], [-3.5, -1.0, -40.0])
+    fleet = fleet_of(*[np.stack([x, 0 * x], axis=1), np.stack([x, away], axis=1)] * 6)
+    assert fork_of(moved(graph_of(*LATE), fleet))[0] == pytest.approx(PARTS, abs=6.0)
+
+
+def test_a_change_of_lanes_far_before_the_fork_does_not_matter() -> None:
+    x = np.arange(-196.0, 400.0, 4.0)
+    away = np.interp(x, [-100.0, -60.0, PARTS, 400.0], [3.5, 0.0, 0.0, -30.0])
+    fleet = fleet_of(*[np.stack([x, 0 * x], axis=1), np.stack([x, away], axis=1)] * 6)
+    graph = graph_of([(-200, 0), (SEEN, 0)], *LATE[1:])
+    assert fork_of(moved(graph, fleet))[0] == pytest.approx(PARTS, abs=6.0)
 
 
 def test_noise_alone_moves_nothing() -> None:
@@ -87,7 +104,8 @@ def test_noise_alone_moves_nothing() -> None:
 
 
 def test_noisy_traces_still_part_where_they_do() -> None:
-    assert fork_of(moved(graph_of(*LATE), drives(n=20, noise=1.0)))[0] == pytest.approx(PARTS, abs=12.0)
+    assert fork_of(moved(graph_of(*LATE), drives(n=20, noise=0.5)))[0] == pytest.approx(PARTS, abs=12.0)
+    assert fork_of(moved(graph_of(*LATE), drives(n=20, noise=1.0)))[0] == pytest.approx(PARTS, abs=20.0)
 
 
 def test_few_traces_and_no_reach_leave_the_graph_as_it_is() -> None:

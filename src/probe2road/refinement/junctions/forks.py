@@ -5,13 +5,14 @@ Strategy
 Two roads that part at a flat angle are one line of pixels until they are some metres apart, so a fork that was traced
 from a mask lies tens of metres behind the place where the roads part. The traces know that place. Before it, the traces
 of either road run along the common one at a constant distance from each other, which is that of the lanes they chose;
-from there on the distance grows. So for every fork the distance between the medians of both groups is taken in bins
-along the common road, and a level followed by a straight rise is fitted: the fork belongs where the line bends. All
-bends are tried for all forks at once, each a weighted least-squares fit with two unknowns in closed form.
+from there on the distance changes: it grows, or shrinks first where the ramp begins in the middle of the road and
+traces swing towards it. So for every fork the distance between the medians of both groups is taken in bins along the
+common road. Seen from the fork, the first stretch of some length on which it stays the same is where both roads are
+still one, and the fork belongs at its near end.
 
-Where a lane of its own leads to a ramp, traces change to it before the fork, and their distance grows by a lane there
-already. So two rises with a level between them, one lane apart, are fitted as well. Where that explains the distances
-much better, the fork belongs where the level ends.
+Where a lane of its own leads to a ramp, traces change to it before the fork: their distance grows by a lane, stays, and
+grows again. The stretch nearest to the fork then is that on the lane, as it should be; it may be shorter, where it lies
+a lane beyond the next. How much the distance may change on a stretch follows its noise, which is told from bin to bin.
 
 Legend of array shapes: E edges, F forks, B bins, n fixes. Ends of edges are numbered: 2 row at u, 2 row + 1 at v.
 """
@@ -19,9 +20,7 @@ Legend of array shapes: E edges, F forks, B bins, n fixes. Ends of edges are num
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -45,15 +44,9 @@ _NEAR, _FAR = 10.0, 40.0  # m from a junction between which the direction of a r
 _SHARE = 0.9  # share of a short road over which the direction is measured
 _STRAIGHT = -0.75  # cosine between the common road and the mean of both branches, at most
 _BIN = 5.0  # m along the common road
-_STEP = 2.5  # m between bends that are tried
-_LEVEL = 10.0  # m of the common road that must be seen before the bend
-_FEWEST_BINS = 5
-_ENOUGH = 20  # traces; a bin with more has no more weight
+_NOISE = 3.0  # times the usual bend of the distances from bin to bin: by this they differ by noise alone
 _KEPT = 10.0  # m of the common road that must remain
 _LEAST = 3.0  # m; moving by less is not worth it
-# Of lanes that lead to a fork, all m: where they end, how long they are, and over what length traces change to them.
-_LANE_ENDS, _LANE_LENGTHS, _LANE_CHANGES = np.arange(0.0, 95.0, 2.5), (10.0, 20.0, 30.0, 45.0, 60.0), (25.0, 45.0, 70.0)
-_LANE_GAIN = 0.5  # largest ratio of the squared errors with two rises to those with one
 
 
 @dataclass(frozen=True)
@@ -61,13 +54,13 @@ _LANE_GAIN = 0.5  # largest ratio of the squared errors with two rises to those 
 class ForkOptions:
     """Which forks are moved, and how far."""
 
-    reach: NotNegative[float] = 120.0  # m along the common road, by which a fork moves at most; 0 moves none
+    reach: NotNegative[float] = 200.0  # m of the common road in which the place of a fork is looked for; 0 moves none
     max_angle: NotNegative[float] = 35.0  # degrees between the two branches of a fork
     min_traces: NotNegative[int] = 3  # traces that each branch needs at a place
-    min_rise: NotNegative[float] = 1.5  # m by which traces must be apart at the old place of the fork
-    confidence: NotNegative[float] = 3.0  # standard errors by which the rise must differ from none
-    min_lane: NotNegative[float] = 2.5  # m, width of a lane that traces change to before they separate
-    max_lane: NotNegative[float] = 4.5  # m; a larger change is not one to a neighbouring lane
+    min_level: NotNegative[float] = 40.0  # m along which traces keep their distance before they part
+    max_change: NotNegative[float] = 0.35  # m by which their distance may change there, or more where it is noisy
+    min_lane_level: NotNegative[float] = 20.0  # m of a level on a lane that traces change to before they part
+    min_lane: NotNegative[float] = 3.0  # m, width of such a lane
     rejoin: NotNegative[float] = 12.0  # m behind the old place of the fork, from which the branches stay as they were
 
 
@@ -84,8 +77,8 @@ def move_forks(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: For
     """Move forks back along the common road to where the traces of the two branches separate.
 
     Topology, ids and attributes stay; geometry, ``length`` and the places of nodes change. A fork stays where it is if
-    a branch has too few traces, if their distance does not grow, or if it grows all along the road that is seen. Where
-    both ends of a road are forks, they share its length. The matches no longer fit the result: match again.
+    a branch has too few traces, if their distance stays the same up to it, or if it changes all along the road that is
+    seen. Where both ends of a road are forks, they share its length. The matches no longer fit the result: match again.
 
     Parameters
     ----------
@@ -116,9 +109,9 @@ def move_forks(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: For
     >>> from probe2road.graph.roadgraph import graph_from_lines
     >>> lines = [[(0, 0), (150, 0)], [(150, 0), (160, 0), (300, 0)], [(150, 0), (160, -6), (300, -20)]]
     >>> graph = graph_from_lines(lines, crs="EPSG:32616")
-    >>> x = np.arange(5.0, 300, 10)
-    >>> lanes = [np.zeros(30), np.minimum(0.0, (100 - x) / 10)]
-    >>> drives = [pd.DataFrame({"trace_id": k, "t": range(30), "x": x, "y": lanes[k % 2]}) for k in range(8)]
+    >>> x = np.arange(2.5, 300, 5)
+    >>> lanes = [np.zeros(60), np.minimum(0.0, (100 - x) / 10)]
+    >>> drives = [pd.DataFrame({"trace_id": k, "t": range(60), "x": x, "y": lanes[k % 2]}) for k in range(8)]
     >>> fleet = fleet_from_tables(pd.concat(drives), crs="EPSG:32616", keep_crs=True)
     >>> moved = move_forks(graph, fleet, match(graph, fleet))
     >>> bool(abs(moved.nodes.geometry[1].x - 100) < 5), bool(moved.edges["length"][0] < 105)
@@ -131,8 +124,7 @@ def move_forks(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: For
     driven, fixes = frame(graph, fleet, matches)
     length = shapely.length(graph.edges.geometry.to_numpy())
     apart, count = _distances(forks, driven, fixes, length, options)
-    bends = _lane_ends(apart, count, _bends(apart, count, options), options)
-    shift = _room(forks, bends, length)
+    shift = _room(forks, _level_ends(apart, count, options), length)
     moved = shift > 0
     logger.info(
         "moved %d of %d forks by %.0f m on average", moved.sum(), len(moved), shift[moved].mean() if moved.any() else 0
@@ -205,104 +197,47 @@ def _branch_taken(forks: Forks, driven: Traversals, fork: NDArray[np.int64], end
     return np.where(other == branches[:, 0], 0, np.where(other == branches[:, 1], 1, -1))
 
 
-def _bends(apart: NDArray[np.float64], count: NDArray[np.int64], options: ForkOptions) -> NDArray[np.float64]:
-    """Return how far (m) from each fork its branches begin to separate, by a fit, ``(F,)``; 0 if nowhere."""
-    at, weight, value = _weighted(apart, count, options)
-    seen = np.where(weight > 0, at, 0.0).max(axis=1)
-    free = (weight > 0).sum(axis=1) - 3.0  # level, rise and bend are fitted
-    sums = weight.sum(axis=1), (weight * value).sum(axis=1), (weight * value**2).sum(axis=1)
-    least, bend = np.full(len(apart), np.inf), np.zeros(len(apart))
-    for place in _places(options):
-        rise = np.maximum(place - at, 0.0)
-        sum_rise, sum_square, sum_product = weight @ rise, weight @ rise**2, (weight * value) @ rise
-        spread = np.maximum(sums[0] * sum_square - sum_rise**2, 1e-9)
-        slope = (sums[0] * sum_product - sum_rise * sums[1]) / spread
-        level = (sums[1] - slope * sum_rise) / np.maximum(sums[0], 1e-9)
-        error = sums[2] - level * sums[1] - slope * sum_product
-        doubt = np.sqrt(np.maximum(error, 1e-9) / np.maximum(free, 1.0) * sums[0] / spread)
-        fits = (np.abs(slope * place) >= options.min_rise) & (np.abs(slope) >= options.confidence * doubt)
-        better = (error < least) & (place <= seen - _LEVEL) & (free >= _FEWEST_BINS - 3)
-        least = np.where(better, error, least)
-        bend = np.where(better, np.where(fits, place, 0.0), bend)
-    return bend
+def _level_ends(apart: NDArray[np.float64], count: NDArray[np.int64], options: ForkOptions) -> NDArray[np.float64]:
+    """Return how far (m) from each fork the first stretch of constant distance begins, ``(F,)``; 0 if there is none."""
+    known = np.where(count >= max(options.min_traces, 1), apart, np.nan)
+    return np.array([_level_end(distances, options) for distances in known])
 
 
-@dataclass(frozen=True)
-class _Lane:
-    """A separate lane that leads to a fork; all lengths are m along the common road, away from the fork."""
-
-    end: float  # where the lane ends
-    length: float
-    change: float  # m over which traces change to the lane, behind its length
-
-    def rises(self, at: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return the model terms of trace distances at places ``(B,)``: the lane, and the rise behind its end."""
-        to_lane = np.clip((self.end + self.length + self.change - at) / self.change, 0.0, 1.0)
-        return [to_lane, np.maximum(self.end - at, 0.0)] if self.end else [to_lane]
-
-
-def _lane_ends(
-    apart: NDArray[np.float64], count: NDArray[np.int64], bend: NDArray[np.float64], options: ForkOptions
-) -> NDArray[np.float64]:
-    """Return bends (m), ``(F,)``, or the end of a lane where a model with a lane fits the distances much better."""
-    bend = bend.copy()
-    bent = np.flatnonzero(bend)
-    at, weight, value = _weighted(apart[bent], count[bent], options)
-    one_rise = np.min([_fit([np.maximum(place - at, 0.0)], weight, value)[1] for place in _places(options)], axis=0)
-    lane_end, two_rises = _best_lanes(at, weight, value, options)
-    changed = two_rises < _LANE_GAIN * one_rise
-    bend[bent[changed]] = lane_end[changed]
-    return bend
+def _level_end(distances: NDArray[np.float64], options: ForkOptions) -> float:
+    """Return how far from one fork the first level begins, given distances ``(B,)`` that are NaN where unknown."""
+    change = max(options.max_change, _NOISE * _usual_bend(distances[np.isfinite(distances)]))
+    starts, levels = _levels(distances, options.min_level, change)
+    if not len(starts):
+        return 0.0
+    first, level = starts[0], levels[0]
+    starts, lanes = _levels(distances[:first], options.min_lane_level, options.max_change)  # noise hides short levels
+    nearest = distances[np.isfinite(distances)][0]
+    leaves = (starts == 0) | ((nearest - lanes) * np.sign(lanes - level) >= options.max_change)
+    on_lane = (np.abs(lanes - level) >= options.min_lane) & leaves
+    first = starts[on_lane][0] if on_lane.any() else first
+    return float((first + 0.5) * _BIN) if first else 0.0
 
 
-def _best_lanes(
-    at: NDArray[np.float64], weight: NDArray[np.float64], value: NDArray[np.float64], options: ForkOptions
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Find the lane that fits the distances at each fork best: return its end (m) and the squared error, ``(F,)`` each.
+def _levels(
+    distances: NDArray[np.float64], length: float, change: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Find where distances ``(B,)`` change by no more than a bound over a length (m): first bins, and the distances.
 
-    The errors are infinite where none fits that is as wide as a lane.
+    At least half of the bins must be known, and the first of them.
     """
-    least, lane_end = np.full(len(value), np.inf), np.zeros(len(value))
-    for lane in _lanes(options):
-        rises, error = _fit(lane.rises(at), weight, value)
-        width = np.abs(rises[:, 0])
-        fits = (width > options.min_lane) & (width < options.max_lane) & (rises[:, 0] * rises[:, -1] >= 0.0)
-        better = fits & (error < least)
-        least, lane_end = np.where(better, error, least), np.where(better, lane.end, lane_end)
-    return lane_end, least
+    size = max(int(np.ceil(length / _BIN)), 1)
+    if len(distances) < size:
+        return np.zeros(0, np.int64), np.zeros(0)
+    part = np.lib.stride_tricks.sliding_window_view(distances, size)
+    known = np.isfinite(part)
+    highest, lowest = np.where(known, part, -np.inf).max(axis=1), np.where(known, part, np.inf).min(axis=1)
+    level = (highest - lowest <= change) & known[:, 0] & (known.sum(axis=1) >= size / 2)
+    return np.flatnonzero(level), (highest[level] + lowest[level]) / 2
 
 
-def _lanes(options: ForkOptions) -> Iterator[_Lane]:
-    """Yield the lanes to try: those that leave enough of the common road behind them."""
-    for lane in (_Lane(*sizes) for sizes in product(_LANE_ENDS.tolist(), _LANE_LENGTHS, _LANE_CHANGES)):
-        if lane.end + lane.length <= options.reach - 2.0 * _LEVEL:
-            yield lane
-
-
-def _places(options: ForkOptions) -> NDArray[np.float64]:
-    """Return the positions of bends to try, m from the fork."""
-    return np.arange(_BIN, options.reach, _STEP)
-
-
-def _weighted(
-    apart: NDArray[np.float64], count: NDArray[np.int64], options: ForkOptions
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the bin middles (m), ``(B,)``, and weights and distances, ``(F, B)``: both 0 where traces are too few."""
-    known = np.isfinite(apart) & (count >= max(options.min_traces, 1))
-    weight = np.where(known, np.minimum(count, _ENOUGH), 0).astype(np.float64)
-    at = (np.arange(apart.shape[1], dtype=np.float64) + 0.5) * _BIN
-    return at, weight, np.where(known, apart, 0.0)
-
-
-def _fit(
-    terms: Sequence[NDArray[np.float64]], weight: NDArray[np.float64], value: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit a level and terms ``(B,)`` to each row of values: return the factors, ``(F, terms)``, and squared errors."""
-    basis = np.vstack([np.ones(value.shape[1]), *terms])
-    normal = np.einsum("fb,ib,jb->fij", weight, basis, basis) + 1e-6 * np.eye(len(basis))
-    right = (weight * value) @ basis.T
-    factors = np.linalg.solve(normal, right[..., None])[..., 0]
-    return factors[:, 1:], np.maximum((weight * value**2).sum(axis=1) - (factors * right).sum(axis=1), 1e-9)
+def _usual_bend(values: NDArray[np.float64]) -> float:
+    """Return the median size of the second differences of values, 0 for fewer than three."""
+    return float(np.median(np.abs(np.diff(values, 2)))) if len(values) > 2 else 0.0
 
 
 def _room(forks: Forks, shift: NDArray[np.float64], length: NDArray[np.float64]) -> NDArray[np.float64]:
