@@ -29,12 +29,13 @@ from probe2road.metrics import evaluate
 from probe2road.recipe import BuildOptions, build
 from probe2road.refinement.centreline import refine_centreline
 from probe2road.refinement.evidence import add_evidence
+from probe2road.refinement.faint import drop_faint
 from probe2road.refinement.gaps.fill import fill_gaps, fill_jumps, gap_weights, prune_gaps
 from probe2road.refinement.junctions.braids import open_braids
 from probe2road.refinement.junctions.forks import move_forks
 from probe2road.refinement.junctions.passages import passing_positions
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
-from probe2road.refinement.undriven import RungOptions, drop_faint, drop_undriven
+from probe2road.refinement.undriven import RungOptions, drop_undriven
 from probe2road.segmentation.options import SegmentationOptions
 
 CITIES = ("boston", "hannover", "tokyo_shibuya")
@@ -132,7 +133,7 @@ def rows(fleet: Fleet, segmenter: str, built: RoadGraph | None) -> list[Row]:
     graph = move_forks(graph, fleet, matches)
     note("forks moved", graph)
     if segmenter == "network":
-        note("faint edges dropped", clean_graph(drop_faint(graph, match(graph, fleet).steps)))
+        note("faint edges dropped", clean_graph(drop_faint(graph, fleet, match(graph, fleet))))
     if segmenter == "density":
         matches = match(graph, fleet)
         note("centrelines moved", refine_centreline(add_evidence(graph, fleet, matches), fleet, matches))

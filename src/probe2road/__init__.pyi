@@ -52,6 +52,7 @@ from .io.graph_files import read_graph as read_graph
 from .io.graph_files import write_graph as write_graph
 from .io.graph_networkx import from_networkx as from_networkx
 from .io.graph_networkx import to_networkx as to_networkx
+from .io.osm_writer import OsmOptions as OsmOptions
 from .matching.labels import LabelOptions as LabelOptions
 from .matching.labels import label as label
 from .matching.match import Matches as Matches
@@ -77,6 +78,7 @@ from .recipe import BuildOptions as BuildOptions
 from .recipe import build as build
 from .refinement.centreline import CentrelineOptions as CentrelineOptions
 from .refinement.evidence import EvidenceOptions as EvidenceOptions
+from .refinement.faint import FaintOptions as FaintOptions
 from .refinement.gaps.links import GapOptions as GapOptions
 from .refinement.heights import HeightOptions as HeightOptions
 from .refinement.junctions.braids import BraidOptions as BraidOptions
@@ -85,7 +87,6 @@ from .refinement.junctions.split import DisambiguateOptions as DisambiguateOptio
 from .refinement.recipe import RefineOptions as RefineOptions
 from .refinement.recipe import refine as refine
 from .refinement.strays import StrayOptions as StrayOptions
-from .refinement.undriven import FaintOptions as FaintOptions
 from .refinement.undriven import RungOptions as RungOptions
 from .run.progress import Progress as Progress
 from .run.progress import progress_bar as progress_bar

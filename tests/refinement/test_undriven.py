@@ -2,7 +2,7 @@ import pandas as pd
 import pytest
 
 from probe2road.errors import OptionError
-from probe2road.refinement.undriven import FaintOptions, RungOptions, drop_faint, drop_undriven
+from probe2road.refinement.undriven import RungOptions, drop_undriven
 from sketches import graph_of
 
 # Two roads side by side with a rung between them, edge 4.
@@ -44,20 +44,3 @@ def test_a_long_edge_is_no_rung():
 def test_negative_options_are_refused():
     with pytest.raises(OptionError, match="min_share is -1"):
         RungOptions(min_share=-1.0)
-
-
-@pytest.mark.parametrize(
-    ("usual", "aside", "kept"), [(20, 3, False), (20, 4, True), (15, 3, True), (10, 1, False), (4, 1, True)]
-)
-def test_faint_is_what_has_few_traces_beside_the_usual(usual, aside, kept):
-    graph = graph_of([(0, 0), (90, 0)], [(90, 0), (180, 0)], [(90, 0), (90, 80)])
-    driven = [(trace, edge) for trace in range(usual) for edge in (0, 1)] + [(trace, 2) for trace in range(aside)]
-    steps = pd.DataFrame(driven, columns=["trace_id", "edge"])
-    assert (2 in drop_faint(graph, steps).edges.index) == kept
-    assert drop_faint(graph, steps, options=FaintOptions(min_traces=0)) is graph
-
-
-def test_no_edge_is_faint_in_a_graph_without_any():
-    graph = graph_of([(0, 0), (90, 0)])
-    nothing = drop_undriven(graph, pd.DataFrame({"trace_id": [], "edge": []}))
-    assert drop_faint(nothing, pd.DataFrame({"trace_id": [], "edge": []})) is nothing

@@ -22,13 +22,14 @@ from probe2road.matching.match import Matches, MatchOptions, match
 from probe2road.options import checked
 from probe2road.refinement.centreline import CentrelineOptions, refine_centreline
 from probe2road.refinement.evidence import EvidenceOptions, add_evidence
+from probe2road.refinement.faint import FaintOptions, drop_faint
 from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, fill_jumps, gap_weights, prune_gaps
 from probe2road.refinement.junctions.braids import BraidOptions, open_braids
 from probe2road.refinement.junctions.forks import ForkOptions, move_forks
 from probe2road.refinement.junctions.passages import passing_positions
 from probe2road.refinement.junctions.split import DisambiguateOptions, split_false_junctions
 from probe2road.refinement.strays import StrayOptions, drop_strays
-from probe2road.refinement.undriven import FaintOptions, RungOptions, drop_faint, drop_undriven
+from probe2road.refinement.undriven import RungOptions, drop_undriven
 from probe2road.run.progress import Progress, silent
 from probe2road.run.stages import GAPS_FILLED, Stage
 
@@ -52,7 +53,7 @@ class RefineOptions:
     braids: BraidOptions = field(default_factory=BraidOptions)  # which chains of edges are roads side by side
     strays: StrayOptions = field(default_factory=StrayOptions)  # which dead ends are errors of positions
     forks: ForkOptions = field(default_factory=ForkOptions)  # which forks are moved to where traces part
-    faint: FaintOptions = field(default_factory=FaintOptions)  # which edges go at last, if there are cameras
+    faint: FaintOptions = field(default_factory=FaintOptions)  # which stretches go at last, where cameras are
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)  # what counts as having driven an edge
     move: bool | None = None  # whether edges move to the middle of what was driven; None: see `settled`
     centreline: CentrelineOptions = field(default_factory=CentrelineOptions)  # how far edges move
@@ -61,9 +62,11 @@ class RefineOptions:
         """Replace options that are None by defaults for learned or unlearned segmentation.
 
         A network has learned where the middle of a road is, so edges are not moved; its false lines are rungs and
-        fragments without drives, which are removed. The lines from density lie where the
-        traces are; where these are few, it may happen that none is matched, so edges without a match are kept. Faint edges go where there is a
-        network and a camera: of a street that phones recorded, one trace may be all that there is.
+        fragments without drives, which are removed. The lines from density lie where the traces are; where these are
+        few, it may happen that none is matched, so edges without a match are kept.
+
+        Faint roads go where there are a network and cameras: of a street that phones recorded, one trace may be all
+        that there is.
         """
         return replace(
             self,
@@ -148,7 +151,7 @@ def _move_forks(at: _Stand) -> RoadGraph:
 def _drop_faint(at: _Stand) -> RoadGraph:
     if not at.options.min_support or at.fleet.points.empty:
         return at.graph
-    clear = drop_faint(at.graph, at.matches.steps, options=at.options.faint)
+    clear = drop_faint(at.graph, at.fleet, at.matches, options=at.options.faint)
     return clear if clear is at.graph else clean_graph(clear, options=at.clean)
 
 
@@ -173,7 +176,7 @@ _STEPS = (
     _Step("open braids", _open_braids),
     _Step("drop strays", _drop_strays),
     _Step("move forks", _move_forks),
-    _Step("drop faint edges", _drop_faint),
+    _Step("drop faint roads", _drop_faint),
     _Step("add evidence", _add_evidence, keeps_roads=True),
     _Step("move edges", _move_edges, keeps_roads=True),
 )

@@ -1,4 +1,4 @@
-"""Edges that too few traces drove on: lines that are no roads, rungs between parallel roads, and faint edges."""
+"""Edges that too few traces drove on: lines that are no roads, and rungs between parallel roads."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from probe2road.graph.clean import drop_edges
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.options import checked
 
-__all__ = ["FaintOptions", "RungOptions", "drop_faint", "drop_undriven", "traces_per_edge"]
+__all__ = ["RungOptions", "drop_undriven", "traces_per_edge"]
 
 
 @dataclass(frozen=True)
@@ -25,15 +25,6 @@ class RungOptions:
     max_length: NotNegative[float] = 60.0  # m; longer edges are roads; 0 takes none for a rung
     min_traces: NotNegative[int] = 4  # an edge with as many traces is a road
     min_share: NotNegative[float] = 0.3  # an edge with this share of the traces at its quieter end is a road, too
-
-
-@dataclass(frozen=True)
-@checked
-class FaintOptions:
-    """Which edges of a finished graph are faint: driven by few traces where roads are driven by many."""
-
-    min_traces: NotNegative[int] = 4  # an edge with as many traces is a road; 0 takes none for faint
-    min_share: NotNegative[float] = 0.2  # an edge with this share of the traces of the median edge is a road, too
 
 
 def drop_undriven(
@@ -87,45 +78,6 @@ def drop_undriven(
     if rungs is not None:
         dropped |= _are_rungs(graph, traces, rungs)
     return drop_edges(graph, dropped, why="that too few traces drove on")
-
-
-def drop_faint(graph: RoadGraph, steps: pd.DataFrame, *, options: FaintOptions | None = None) -> RoadGraph:
-    """Remove edges that few traces drove on, as far as the graph is driven by more.
-
-    A graph whose edges have a few traces each stays as it is: how many are few is told by the median edge.
-
-    Parameters
-    ----------
-    graph
-        Any road graph.
-    steps
-        Matched paths on that graph: `probe2road.matching.match.Matches.steps`.
-    options
-        None takes the defaults.
-
-    Returns
-    -------
-    RoadGraph
-        Not merged; turns on removed edges are dropped. The graph itself where no edge is faint.
-
-    Examples
-    --------
-    A road that three traces took is faint beside one that twenty took, but not beside one that five took:
-
-    >>> from probe2road.graph.roadgraph import graph_from_lines
-    >>> graph = graph_from_lines([[(0, 0), (90, 0)], [(90, 0), (180, 0)], [(90, 0), (90, 80)]], crs="EPSG:32616")
-    >>> aside = [(trace, 2) for trace in range(3)]
-    >>> for usual in (20, 5):
-    ...     through = [(trace, edge) for trace in range(usual) for edge in (0, 1)]
-    ...     drop_faint(graph, pd.DataFrame(through + aside, columns=["trace_id", "edge"])).edges.index.tolist()
-    [0, 1]
-    [0, 1, 2]
-    """
-    options = options or FaintOptions()
-    traces = traces_per_edge(graph, steps)
-    usual = float(np.median(traces)) if len(traces) else 0.0
-    dropped = traces < min(options.min_traces, options.min_share * usual)
-    return drop_edges(graph, dropped, why="that few traces drove on, as roads here go")
 
 
 def traces_per_edge(graph: RoadGraph, steps: pd.DataFrame) -> NDArray[np.int64]:
