@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from probe2road.errors import InputError, needs_extra
 from probe2road.segmentation.dlinknet import STRIDE
 from probe2road.segmentation.export_onnx import export, load_parameters
-from probe2road.segmentation.weights import ModelInfo, replace_info
+from probe2road.segmentation.weights import ModelInfo, read_weights, replace_info
 from probe2road.training.config import TrainConfig
 from probe2road.training.loop import predict_squares
 from probe2road.training.state import BEST, TrainingState, build_network
@@ -63,7 +64,7 @@ def export_best(config: TrainConfig, state: TrainingState, output: str | Path, *
         network={"architecture": config.architecture},
         tile=config.tile,
         stride=STRIDE,
-        training={"config": asdict(config), "step": kept["step"], "curve": state.curve},
+        training={"config": _described(config), "step": kept["step"], "curve": state.curve, **_before(config)},
     )
     file = Path(output) / f"{config.name}.onnx"
     export(network, info, file)
@@ -78,3 +79,13 @@ def export_best(config: TrainConfig, state: TrainingState, output: str | Path, *
     training = {**info.training, "thresholds": sweep}
     replace_info(file, replace(info, threshold=at, seed_threshold=at, training=training))
     return file
+
+
+def _described(config: TrainConfig) -> dict[str, Any]:
+    """Return the configuration without the folders of this machine."""
+    return asdict(replace(config, start_from=Path(config.start_from).name))
+
+
+def _before(config: TrainConfig) -> dict[str, Any]:
+    """Return how the weights were trained that the run began with, where it did not begin with random ones."""
+    return {"before": dict(read_weights(config.start_from).info.training)} if config.start_from else {}
