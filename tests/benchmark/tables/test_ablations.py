@@ -68,8 +68,8 @@ def test_the_command_writes_a_page_cells_and_figures(sets, work, tmp_path, monke
     of_gap, of_reference = rows[2:5], rows[5:]
     assert [json.loads(row["config"])["min_drives"] for row in of_reference] == [1, 4, 16]
     assert of_gap[1]["geo_f1"] == of_reference[1]["geo_f1"] == rows[0]["geo_f1"]
-    # Roads that few passed were hardly found, so a reference of busy roads is found more completely.
-    assert float(of_reference[-1]["geo_recall"]) >= float(of_reference[0]["geo_recall"])
+    # Roads that few passed are found as well as busy ones; against busy ones alone they are too much.
+    assert min(float(row["geo_recall"]) for row in of_reference) > 0.9
     assert float(of_reference[-1]["geo_precision"]) < float(of_reference[0]["geo_precision"])
 
 
