@@ -2,7 +2,7 @@
 
 Usage: python experiments/real_cameras.py FOLDER --aligned aligned.parquet [--picture docs/img/real-camera.png]
 
-FOLDER holds drives.parquet of the UAH-DriveSet, and `--aligned` names what `probe2road align` made of it, with its points
+FOLDER holds drives.parquet of the UAH-DriveSet, and `--aligned` names what `probe2road align` made of it, its points
 beside it. Prints the rows of docs/results/real-traces.md for traces alone and for aligned drives with cameras: nodes,
 junctions and dead ends of the graph of all drives, and GEO F1 at 6 m of the graph of every fourth drive against that of
 the others.

@@ -58,7 +58,8 @@ def osrm(pbf: Path, folder: Path) -> Iterator[Router]:
     for tool in ("osrm-partition", "osrm-customize"):
         _run(home / "bin" / tool, "--threads", "1", base)
     port = _free_port()
-    command = [home / "bin" / "osrm-routed", "--algorithm", "mld", "--ip", "127.0.0.1", "--port", str(port), base]
+    server = home / "bin" / "osrm-routed"
+    command: list[str | Path] = [server, "--algorithm", "mld", "--ip", "127.0.0.1", "--port", str(port), base]
 
     def route(places: NDArray[np.float64]) -> Route | None:
         text = ";".join(f"{lon:.7f},{lat:.7f}" for lon, lat in places)
