@@ -30,7 +30,8 @@ from probe2road.recipe import BuildOptions, build
 from probe2road.refinement.centreline import refine_centreline
 from probe2road.refinement.evidence import add_evidence
 from probe2road.refinement.faint import drop_faint
-from probe2road.refinement.gaps.fill import fill_gaps, fill_jumps, gap_weights, prune_gaps
+from probe2road.refinement.gaps.driven import add_driven_roads
+from probe2road.refinement.gaps.fill import fill_gaps, gap_weights, prune_gaps
 from probe2road.refinement.junctions.braids import open_braids
 from probe2road.refinement.junctions.forks import move_forks
 from probe2road.refinement.junctions.passages import passing_positions
@@ -104,11 +105,10 @@ def rows(fleet: Fleet, segmenter: str, built: RoadGraph | None) -> list[Row]:
     note("no post-processing", built)
     filled = fill_gaps(built)
     matches = match(filled, fleet, edge_weights=gap_weights(filled))
-    note("gap filling", clean_graph(prune_gaps(filled, matches.steps)))
-    filled = fill_jumps(filled, matches.steps)
-    matches = match(filled, fleet, edge_weights=gap_weights(filled))
     graph = clean_graph(prune_gaps(filled, matches.steps))
-    note("and where traces jump", graph)
+    note("gap filling", graph)
+    graph = add_driven_roads(graph, fleet)
+    note("driven roads added", graph)
     matches = match(graph, fleet)
     for variant in ("literal", "guarded"):
         options = DisambiguateOptions(variant=variant)

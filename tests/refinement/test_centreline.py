@@ -135,3 +135,22 @@ def test_any_graph_stays_a_graph(seed: int) -> None:
     for old, new in pairwise([graph.edges, moved.edges]):
         assert (shapely.is_simple(new.geometry.to_numpy()) | ~shapely.is_simple(old.geometry.to_numpy())).all()
         assert shapely.hausdorff_distance(old.geometry.to_numpy(), new.geometry.to_numpy()).max(initial=0.0) < 8.0
+
+
+def test_edges_stay_where_lines_were_drawn() -> None:
+    # The mask has the first half, 3 m beside the traffic; the second half was drawn by refinement.
+    graph = graph_of([(0, 3), (300, 3), (600, 3)])
+    data = fleet([[(0, 0), (600, 0)]] * 5)
+    moved = refine_centreline(graph, data, match(graph, data), drawn=graph_of([(0, 3), (300, 3)]))
+    check_graph(moved)
+    line = moved.edges.geometry.iloc[0]
+    at = [shapely.line_interpolate_point(line, x).y for x in (0, 150, 280, 450, 600)]
+    assert at[:3] == pytest.approx([3.0, 3.0, 3.0], abs=0.3)
+    assert at[3:] == pytest.approx([0.0, 0.0], abs=0.3)
+
+
+def test_what_crosses_a_drawn_line_does_not_stay() -> None:
+    graph = graph_of([(0, 3), (600, 3)])
+    data = fleet([[(0, 0), (600, 0)]] * 5)
+    across = graph_of(*([(x, -50), (x, 50)] for x in range(0, 601, 20)))
+    assert np.abs(heights(refine_centreline(graph, data, match(graph, data), drawn=across))).max() < 0.3

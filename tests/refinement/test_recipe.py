@@ -9,7 +9,7 @@ import shapely
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.refinement.gaps.fill import GapOptions
+from probe2road.refinement.gaps.driven import DrivenOptions
 from probe2road.refinement.recipe import RefineOptions, refine
 from sketches import fleet_of, graph_of, spaced
 
@@ -27,8 +27,8 @@ def drives(n: int = 6) -> Fleet:
     return fleet_of(*(road for road in (bridge, *below) for _ in range(n)))
 
 
-def refined(graph: RoadGraph, **gaps: float) -> RoadGraph:
-    result = refine(graph, drives(), learned=False, options=RefineOptions(gaps=GapOptions(**gaps)))
+def refined(graph: RoadGraph, **driven: float) -> RoadGraph:
+    result = refine(graph, drives(), learned=False, options=RefineOptions(driven=DrivenOptions(**driven)))
     check_graph(result)
     return result
 
@@ -40,9 +40,8 @@ def test_a_bridge_that_the_mask_lost_becomes_one_road_over_the_others() -> None:
     assert (graph.edges["support"] == 6).all()
 
 
-@pytest.mark.parametrize("gaps", [{"max_jump": 70.0}, {"min_jumps": 7}])
-def test_without_proof_it_stays_in_pieces(gaps: dict[str, float]) -> None:
-    graph = refined(graph_of(*LOST), **gaps)
+def test_without_proof_it_stays_in_pieces() -> None:
+    graph = refined(graph_of(*LOST), min_traces=7)
     assert sorted(graph.edges["length"].round())[-1] < 700.0
 
 

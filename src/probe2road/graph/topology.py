@@ -16,8 +16,9 @@ import numpy as np
 import shapely
 from numba import njit
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
-__all__ = ["Topology", "chains", "end_nodes", "joined_lines", "mates"]
+__all__ = ["Topology", "chains", "end_nodes", "joined_lines", "mates", "shortest_arcs"]
 
 
 @dataclass(frozen=True)
@@ -118,3 +119,21 @@ def joined_lines(
         names, group = np.unique(chain[owner[wanted]], return_inverse=True)
         joined[names] = shapely.linestrings(coordinates[source[wanted]], indices=group)
     return joined
+
+
+def shortest_arcs(a: NDArray[np.int64], b: NDArray[np.int64], size: NDArray[np.float64], n_nodes: int) -> csr_array:
+    """Return the undirected graph of arcs for scipy's routing, with only the shortest of parallel arcs.
+
+    A sparse matrix would add the sizes of parallel arcs up, and take an arc of length 0 for none.
+
+    Examples
+    --------
+    >>> shortest_arcs(np.array([0, 1]), np.array([1, 0]), np.array([7.0, 5.0]), 2).toarray().tolist()
+    [[0.0, 5.0], [0.0, 0.0]]
+    """
+    low, high, size = np.minimum(a, b), np.maximum(a, b), np.maximum(size, 1e-12)
+    order = np.lexsort((size, high, low))
+    low, high, size = low[order], high[order], size[order]
+    shortest = np.ones(len(low), bool)
+    shortest[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
+    return csr_array((size[shortest], (low[shortest], high[shortest])), shape=(n_nodes, n_nodes))

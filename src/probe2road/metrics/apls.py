@@ -16,7 +16,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from probe2road.bounds import NotNegative, Positive
 from probe2road.graph.roadgraph import RoadGraph
-from probe2road.metrics.network import EPSILON, Network, locate, shortest_arcs
+from probe2road.graph.topology import shortest_arcs
+from probe2road.metrics.network import EPSILON, Network, locate
 from probe2road.metrics.normalise import comparable_networks
 from probe2road.metrics.scores import Score
 from probe2road.options import checked

@@ -12,11 +12,10 @@ import numpy as np
 import shapely
 from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from probe2road.graph.roadgraph import RoadGraph
 
-__all__ = ["EPSILON", "Network", "locate", "network_from_graph", "shortest_arcs"]
+__all__ = ["EPSILON", "Network", "locate", "network_from_graph"]
 
 EPSILON = 1e-6  # m; positions nearer than this are the same: coordinates of 10^6 m have a resolution of 10^-9 m
 
@@ -100,24 +99,6 @@ def network_from_graph(graph: RoadGraph) -> Network:
         incident_edge=(order // 2).astype(np.int64),
         lines=shapely.linestrings(xy, indices=owner) if n_edges else np.empty(0, object),
     )
-
-
-def shortest_arcs(a: NDArray[np.int64], b: NDArray[np.int64], size: NDArray[np.float64], n_nodes: int) -> csr_array:
-    """Return the undirected graph of arcs for scipy's routing, with only the shortest of parallel arcs.
-
-    A sparse matrix would add the sizes of parallel arcs up, and take an arc of length 0 for none.
-
-    Examples
-    --------
-    >>> shortest_arcs(np.array([0, 1]), np.array([1, 0]), np.array([7.0, 5.0]), 2).toarray().tolist()
-    [[0.0, 5.0], [0.0, 0.0]]
-    """
-    low, high, size = np.minimum(a, b), np.maximum(a, b), np.maximum(size, 1e-12)
-    order = np.lexsort((size, high, low))
-    low, high, size = low[order], high[order], size[order]
-    shortest = np.ones(len(low), bool)
-    shortest[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
-    return csr_array((size[shortest], (low[shortest], high[shortest])), shape=(n_nodes, n_nodes))
 
 
 def locate(

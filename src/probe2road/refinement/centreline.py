@@ -27,6 +27,7 @@ from probe2road.bounds import NotNegative, Positive, Share
 from probe2road.crs import require_same_crs
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
+from probe2road.matching.beside import edge_beside
 from probe2road.matching.frame import (
     EdgeLines,
     FramedFixes,
@@ -46,6 +47,8 @@ __all__ = ["CentrelineOptions", "refine_centreline"]
 
 logger = logging.getLogger(__name__)
 
+_DRAWN, _DRAWN_ANGLE = 1.5, 20.0  # m and degrees from a drawn line, up to which an edge runs along it
+_HELD = 1000.0  # votes by which an edge stays on a drawn line
 _STEPS = (1.0, 0.5, 0.25, 0.0)  # shares of the shift of an edge that are tried, until the edge does not fold
 
 
@@ -70,7 +73,12 @@ class CentrelineOptions:
 
 
 def refine_centreline(
-    graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: CentrelineOptions | None = None
+    graph: RoadGraph,
+    fleet: Fleet,
+    matches: Matches,
+    *,
+    options: CentrelineOptions | None = None,
+    drawn: RoadGraph | None = None,
 ) -> RoadGraph:
     """Move edges to the middle of what was driven.
 
@@ -88,6 +96,8 @@ def refine_centreline(
         From `probe2road.matching.match.match`.
     options
         None takes the defaults.
+    drawn
+        Edges stay where they run along a line of this graph. None moves all of them.
 
     Returns
     -------
@@ -130,6 +140,10 @@ def refine_centreline(
         both = weight * np.nan_to_num(offset) + seen_weight * np.nan_to_num(seen)
         offset, weight = np.divide(both, total, out=np.zeros(len(total)), where=total > 0), total
     weight = weight * _enough(driven, len(graph.edges), options.min_traces)[stations.edge]
+    if drawn is not None:
+        place, direction = lines.at(stations.edge, stations.along)
+        there = edge_beside(drawn, place[:, :2], direction, radius=_DRAWN, max_angle=_DRAWN_ANGLE) >= 0
+        offset, weight = np.where(there, 0.0, offset), np.where(there, _HELD, weight)
     shift = smooth_stations(
         np.clip(np.nan_to_num(offset), -options.max_left, options.max_left), weight / options.vote_sigma**2, stations,
         reach=options.reach, pull=1.0 / options.prior_sigma**2,

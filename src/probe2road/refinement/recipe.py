@@ -23,7 +23,8 @@ from probe2road.options import checked
 from probe2road.refinement.centreline import CentrelineOptions, refine_centreline
 from probe2road.refinement.evidence import EvidenceOptions, add_evidence
 from probe2road.refinement.faint import FaintOptions, drop_faint
-from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, fill_jumps, gap_weights, prune_gaps
+from probe2road.refinement.gaps.driven import DrivenOptions, add_driven_roads
+from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, gap_weights, prune_gaps
 from probe2road.refinement.junctions.braids import BraidOptions, open_braids
 from probe2road.refinement.junctions.forks import ForkOptions, move_forks
 from probe2road.refinement.junctions.passages import passing_positions
@@ -38,6 +39,10 @@ __all__ = ["RefineOptions", "refine"]
 logger = logging.getLogger(__name__)
 
 
+# What refinement draws are straight lines between roads, metres off in places: they may move farther, and bend more.
+_REDRAWING = CentrelineOptions(spacing=5.0, reach=15.0, max_shift=15.0, prior_sigma=10.0, fade=10.0)
+
+
 @dataclass(frozen=True)
 @checked
 class RefineOptions:
@@ -47,6 +52,7 @@ class RefineOptions:
     gap_weight: Annotated[float, Above(0), AtMost(1)] = 0.1  # weight of turning into a gap edge; other edges have 1
     gaps: GapOptions = field(default_factory=GapOptions)  # which gaps are filled
     matching: MatchOptions = field(default_factory=MatchOptions)  # how traces are matched
+    driven: DrivenOptions = field(default_factory=DrivenOptions)  # which roads are added that only traces show
     min_support: NotNegative[int] | None = None  # fewest traces on an edge; 0 keeps all; None: see `settled`
     rungs: RungOptions = field(default_factory=RungOptions)  # which edges need more than min_support
     junctions: DisambiguateOptions = field(default_factory=DisambiguateOptions)  # which junctions are split
@@ -55,15 +61,16 @@ class RefineOptions:
     forks: ForkOptions = field(default_factory=ForkOptions)  # which forks are moved to where traces part
     faint: FaintOptions = field(default_factory=FaintOptions)  # which stretches go at last, where cameras are
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)  # what counts as having driven an edge
-    move: bool | None = None  # whether edges move to the middle of what was driven; None: see `settled`
+    move: bool | None = None  # whether all edges move to the middle of what was driven; None: see `settled`
     centreline: CentrelineOptions = field(default_factory=CentrelineOptions)  # how far edges move
+    redrawing: CentrelineOptions = field(default_factory=lambda: _REDRAWING)  # how far, where the mask has no line
 
     def settled(self, *, learned: bool) -> RefineOptions:
         """Replace options that are None by defaults for learned or unlearned segmentation.
 
-        A network has learned where the middle of a road is, so edges are not moved; its false lines are rungs and
-        fragments without drives, which are removed. The lines from density lie where the traces are; where these are
-        few, it may happen that none is matched, so edges without a match are kept.
+        A network has learned where the middle of a road is, so edges move only where it drew none; its false lines are
+        rungs and fragments without drives, which are removed. The lines from density lie where the traces are; where
+        these are few, it may happen that none is matched, so edges without a match are kept.
 
         Faint roads go where there are a network and cameras: of a street that phones recorded, one trace may be all
         that there is.
@@ -84,6 +91,7 @@ class _Stand:
     matches: Matches
     options: RefineOptions
     clean: CleanOptions | None
+    drawn: RoadGraph  # what the refinement was given
 
 
 @dataclass(frozen=True)
@@ -114,12 +122,12 @@ class _Step:
     stage: Stage | None = None
 
 
-def _fill_jumps(at: _Stand) -> RoadGraph:
-    return fill_jumps(at.graph, at.matches.steps, options=at.options.gaps)
-
-
 def _prune_gaps(at: _Stand) -> RoadGraph:
     return clean_graph(prune_gaps(at.graph, at.matches.steps, min_traces=at.options.min_traces), options=at.clean)
+
+
+def _add_driven(at: _Stand) -> RoadGraph:
+    return add_driven_roads(at.graph, at.fleet, options=at.options.driven)
 
 
 def _split_junctions(at: _Stand) -> RoadGraph:
@@ -160,15 +168,15 @@ def _add_evidence(at: _Stand) -> RoadGraph:
 
 
 def _move_edges(at: _Stand) -> RoadGraph:
-    if not at.options.move:
-        return at.graph
-    return refine_centreline(at.graph, at.fleet, at.matches, options=at.options.centreline)
+    if at.options.move:
+        return refine_centreline(at.graph, at.fleet, at.matches, options=at.options.centreline)
+    return refine_centreline(at.graph, at.fleet, at.matches, options=at.options.redrawing, drawn=at.drawn)
 
 
 # What is split and dropped the first time may have hidden further false junctions: both come twice.
 _STEPS = (
-    _Step("fill jumps", _fill_jumps, proposed=True),
     _Step("prune gaps", _prune_gaps, proposed=True, stage=GAPS_FILLED),
+    _Step("add driven roads", _add_driven),
     _Step("split junctions", _split_junctions),
     _Step("drop undriven edges", _drop_undriven),
     _Step("split junctions again", _split_junctions),
@@ -242,6 +250,7 @@ def refine(
     if graph.edges.empty:
         return graph
     report("refinement", 0, len(_STEPS))
+    drawn = graph
     graph = fill_gaps(graph, options=options.gaps)
     matches: Matches | None = None
     weighted = changed = True
@@ -250,7 +259,7 @@ def refine(
             continue
         if matches is None or weighted != step.proposed:
             matches, weighted = _matched(graph, fleet, options, proposed=step.proposed), step.proposed
-        result = step.apply(_Stand(graph, fleet, matches, options, clean))
+        result = step.apply(_Stand(graph, fleet, matches, options, clean, drawn))
         changed = result is not graph
         if changed and not step.keeps_roads:
             logger.info("%s: %d nodes and %d edges", step.name, len(result.nodes), len(result.edges))

@@ -13,7 +13,7 @@ from probe2road.errors import OptionError
 from probe2road.graph.check import check_graph
 from probe2road.graph.roadgraph import RoadGraph, empty_graph
 from probe2road.graph.splitting import split_edges
-from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, fill_jumps, gap_weights, prune_gaps
+from probe2road.refinement.gaps.fill import GapOptions, fill_gaps, gap_weights, prune_gaps
 from probe2road.refinement.gaps.stems import facing_stems
 from sketches import UTM, graph_of
 
@@ -214,45 +214,6 @@ class TestSplitEdges:
         check_graph(cut)
         assert cut.edges[["u", "v"]].to_numpy().tolist() == [[0, 1], [1, 0]]
         assert shapely.union_all(cut.edges.geometry.to_numpy()).length == pytest.approx(ring.length)
-
-
-class TestJumps:
-    """A road that is lost where it passes over two others, with the ends of its mask grown into these."""
-
-    LINES = ([(0, 0), (100, 0)], [(180, 0), (300, 0)], [(120, -90), (120, 90)], [(160, -90), (160, 90)])
-
-    @staticmethod
-    def steps(*edges: int, traces: int = 2, forward: bool = True) -> pd.DataFrame:
-        """Traces on one edge after the other, off the graph between."""
-        rows = [{"trace_id": trace, "edge": edge} for trace in range(traces) for edge in edges]
-        return pd.DataFrame(rows).assign(forward=forward, entered=False, left=False)
-
-    def added(self, steps: pd.DataFrame, **options: Any) -> list[str]:
-        graph = graph_of(*self.LINES)
-        filled = fill_jumps(graph, steps, options=GapOptions(**options))
-        check_graph(filled)
-        assert (filled is graph) == (len(filled.edges) == len(graph.edges))
-        return [line.wkt for line in filled.edges.geometry[filled.edges["origin"] == "gap"]]
-
-    @pytest.mark.parametrize(("first", "second", "forward"), [(0, 1, True), (1, 0, False)])
-    def test_ends_between_which_traces_jump_are_joined_across_other_roads(
-        self, first: int, second: int, forward: bool
-    ) -> None:
-        assert self.added(self.steps(first, second, forward=forward)) == ["LINESTRING (100 0, 180 0)"]
-
-    def test_one_trace_is_no_proof_and_a_jump_may_be_too_long(self) -> None:
-        assert self.added(self.steps(0, 1, traces=1)) == []
-        assert self.added(self.steps(0, 1, traces=1), min_jumps=1) == ["LINESTRING (100 0, 180 0)"]
-        assert self.added(self.steps(0, 1), max_jump=79.0) == []
-
-    def test_traces_that_are_back_elsewhere_have_left_the_road(self) -> None:
-        assert self.added(self.steps(1, 0)) == []  # from one far end to the other
-        assert self.added(self.steps(0, 3)) == []  # onto a road across
-        assert self.added(self.steps(0, 0)) == []
-
-    def test_traces_that_stay_on_the_graph_jump_nowhere(self) -> None:
-        assert self.added(self.steps(0, 1).assign(left=True)) == []
-        assert self.added(self.steps(0, 1).iloc[:0]) == []
 
 
 BARS = [[(0, 0), (50, 0)], [(50, 0), (99, 0)], [(0, 20), (50, 20)], [(50, 20), (99, 20)]]

@@ -213,6 +213,16 @@ class TestArtefacts:
                 len(split_false_junctions(FLAT, self.crossing, positions=apart(self.crossing), options=off).edges) == 5
             )
 
+    def test_what_a_node_settles_by_itself_is_no_artefact(self) -> None:
+        # Another road passes over one end of the edge between two forks, which is a real road.
+        lines = [list(line.coords) for line in FLAT.edges.geometry]
+        graph = graph_of(*lines, [(12, 0), (40, 150)], [(12, 0), (-16, -150)])
+        steps = steps_of(graph, {(0, 4, 3): 9, (1, 4, 2): 9, (5, 6): 9})
+        split = split_false_junctions(graph, steps, positions=apart(steps), options=NOT_MERGED)
+        check_graph(split)
+        assert [5, 6] in parts(split)
+        assert 4 in split.edges.index
+
     def test_traces_that_mix_prove_a_real_road(self) -> None:
         steps = steps_of(FLAT, {(0, 4, 3): 9, (1, 4, 2): 9, (0, 4, 2): 4})
         assert len(split_false_junctions(FLAT, steps, positions=apart(steps)).edges) == 5

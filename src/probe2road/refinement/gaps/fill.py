@@ -9,20 +9,17 @@ What is left is taken from the shortest link to the longest, as long as it does 
 from __future__ import annotations
 
 import logging
-from dataclasses import fields, replace
+from dataclasses import fields
 
-import geopandas as gpd
 import numpy as np
 import pandas as pd
 import shapely
-from numpy.typing import NDArray
 
 from probe2road.errors import OptionError
 from probe2road.graph.clean import drop_edges, merge_degree_two_nodes
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.splitting import split_edges
-from probe2road.graph.tables import finish_edges
-from probe2road.refinement.gaps.jumps import jumped_gaps
+from probe2road.refinement.gaps.added import with_gap_edges
 from probe2road.refinement.gaps.links import (
     NO_NODE,
     DeadEnds,
@@ -38,7 +35,7 @@ from probe2road.refinement.gaps.links import (
 from probe2road.refinement.gaps.stems import facing_stems
 from probe2road.refinement.undriven import traces_per_edge
 
-__all__ = ["GapOptions", "fill_gaps", "fill_jumps", "gap_weights", "prune_gaps"]
+__all__ = ["GapOptions", "fill_gaps", "gap_weights", "prune_gaps"]
 
 logger = logging.getLogger(__name__)
 
@@ -110,46 +107,7 @@ def fill_gaps(graph: RoadGraph, *, options: GapOptions | None = None) -> RoadGra
     filled = _with_links(graph, ends, links) if len(links.end) else graph
     stems = facing_stems(filled, options)
     logger.info("added %d gap edges between junctions", len(stems))
-    return _with_edges(filled, *filled.nodes.index.to_numpy()[stems.T]) if len(stems) else filled
-
-
-def fill_jumps(graph: RoadGraph, steps: pd.DataFrame, *, options: GapOptions | None = None) -> RoadGraph:
-    """Add edges of origin ``gap`` where traces leave the graph and return to it.
-
-    The paper does not have this rule. Edge ends up to ``max_jump`` apart are joined if ``min_jumps`` traces or more
-    jump from one to the other, and if the turns at both ends are at most ``jump_turn``. A link may cross edges: so it
-    is where a road is lost between the others that it passes over.
-
-    Parameters
-    ----------
-    graph
-        Any road graph.
-    steps
-        Matched paths on it: `probe2road.matching.match.Matches.steps`.
-    options
-        None takes the defaults.
-
-    Returns
-    -------
-    RoadGraph
-        The same object where there is nothing to add. As with `fill_gaps`, links are proposals.
-
-    Raises
-    ------
-    InputError
-        If the steps name an edge that is not in the graph.
-
-    Examples
-    --------
-    >>> from probe2road.graph.roadgraph import graph_from_lines
-    >>> graph = graph_from_lines([[(0, 0), (100, 0)], [(160, 0), (300, 0)]], crs="EPSG:32616")
-    >>> steps = pd.DataFrame({"trace_id": [1, 1, 2, 2], "edge": [0, 1, 0, 1], "forward": True})
-    >>> print(fill_jumps(graph, steps.assign(entered=False, left=False)).edges.geometry.iloc[2])
-    LINESTRING (100 0, 160 0)
-    """
-    pairs = jumped_gaps(graph, steps, options or GapOptions())
-    logger.info("added %d gap edges where traces jump", len(pairs))
-    return _with_edges(graph, *graph.nodes.index.to_numpy()[pairs.T]) if len(pairs) else graph
+    return with_gap_edges(filled, *filled.nodes.index.to_numpy()[stems.T]) if len(stems) else filled
 
 
 def gap_weights(graph: RoadGraph, *, gap: float = 0.1) -> pd.Series:
@@ -253,31 +211,4 @@ def _with_links(graph: RoadGraph, ends: DeadEnds, links: Links) -> RoadGraph:
     u = names[ends.node[links.end]]
     v = names[links.node]
     v[into] = made
-    return _with_edges(graph, u, v)
-
-
-def _with_edges(graph: RoadGraph, u: NDArray[np.int64], v: NDArray[np.int64]) -> RoadGraph:
-    """Add straight edges of origin ``gap`` between nodes."""
-    lines = _straight_lines(graph, u, v)
-    first = int(graph.edges.index.max()) + 1
-    new = gpd.GeoDataFrame(
-        {"u": u, "v": v, "origin": "gap"},
-        geometry=lines,
-        index=np.arange(first, first + len(u)),
-        crs=graph.crs,
-    )
-    edges = pd.concat([graph.edges, finish_edges(new)])
-    return replace(graph, edges=finish_edges(edges))
-
-
-def _straight_lines(graph: RoadGraph, u: NDArray[np.int64], v: NDArray[np.int64]) -> NDArray[np.object_]:
-    """Draw straight lines between nodes, with heights taken from the edges there if the edges have heights."""
-    edges = graph.edges
-    lines = edges.geometry.to_numpy()
-    if shapely.has_z(lines).any():
-        ends = shapely.get_point(np.stack([lines, lines]), np.array([[0], [-1]])).ravel()
-        of_node = pd.Series(ends, index=np.concatenate([edges["u"], edges["v"]])).groupby(level=0).first()
-    else:
-        of_node = graph.nodes.geometry
-    xyz = [shapely.get_coordinates(of_node[node].to_numpy(), include_z=shapely.has_z(lines).any()) for node in (u, v)]
-    return np.asarray(shapely.linestrings(np.stack(xyz, axis=1)))
+    return with_gap_edges(graph, u, v)

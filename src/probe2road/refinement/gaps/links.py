@@ -55,9 +55,6 @@ class GapOptions:
     heading_length: Positive[float] = 15.0  # m, over which the direction of a dead end is measured
     max_links: NotNegative[int] = 2  # links at one node
     stem_turn: NotNegative[float] = 20.0  # degrees, at both ends of a link between junctions face to face; 0: none
-    max_jump: NotNegative[float] = 100.0  # m, between edge ends that are joined because traces jump across; 0: none
-    min_jumps: NotNegative[int] = 2  # fewest traces that must jump
-    jump_turn: NotNegative[float] = 60.0  # degrees, between road and link, at both of its ends
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,9 @@ def _guarded(graph: RoadGraph, single: Passages, options: DisambiguateOptions) -
     at_nodes = places_at_nodes(graph)
     group = proven_groups(graph, evidence(at_nodes, single), rules)
 
+    groups = pd.Series(group).groupby(at_nodes.junction).nunique().reindex(np.arange(len(graph.nodes)), fill_value=1)
     inner = _possible_artefacts(graph, options.max_inner)
+    inner = inner[(groups.to_numpy()[graph.end_rows[inner]] == 1).all(axis=1)]  # what splits by itself is no artefact
     double, at_ends = double_passages(graph, single, inner)
     around = places_around(graph, inner)
     found = evidence(around, double)
