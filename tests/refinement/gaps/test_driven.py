@@ -72,6 +72,25 @@ def test_traces_must_be_enough_and_all_drive_all_of_it():
     assert roads(graph, fleet_of(*along(*ARC, times=2), *along(*other, times=2))) == []
 
 
+def test_few_of_many_are_errors():
+    lines = [[(0, 0), (300, 0)], [(300, 0), (300, 300)]]
+    usual = along((0, 0), (300, 0), (300, 300), times=100, spread=0.02)
+    way = [(0, 0), (100, 0), (200, 80), (300, 200), (300, 300)]
+    graph, fleet = graph_of(*lines), fleet_of(*usual, *along(*way))
+    assert roads(graph, fleet, detour=1.0) == []
+    assert len(roads(graph, fleet, detour=1.0, min_share=0.03)) == 1
+
+
+def test_lanes_of_a_road_that_is_nowhere_drawn_are_one_road():
+    graph = graph_of([(-100, 0), (0, 0)], [(500, 0), (600, 0)])
+    lanes = [
+        drive
+        for y in (-6.0, 0.0, 6.0)
+        for drive in along((-100, 0), (0, 0), (30, y), (470, y), (500, 0), (600, 0), times=6)
+    ]
+    assert len(roads(graph, fleet_of(*lanes))) == 1
+
+
 def test_a_lane_beside_a_road_is_none():
     graph = graph_of([(0, 0), (600, 0)], [(100, 0), (0, 100)])
     lane = [(0, 100), (92, 8), (110, 8), (400, 8), (420, 0), (600, 0)]

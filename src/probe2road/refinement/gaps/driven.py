@@ -8,7 +8,7 @@ if an edge of about its direction lies beside it, so that the motorway explains 
 are runs of unexplained points between two explained ones. The longest run that enough traces accompanied on all of its
 way becomes a road, drawn through the middle of its company; then the next of those that no road has taken up.
 
-Legend of array shapes: P points, C points in or near a run, R runs, B bundles.
+Legend of array shapes: P points, R runs, B bundles.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from probe2road.bounds import NotNegative, Positive
+from probe2road.bounds import NotNegative, Positive, Share
 from probe2road.crs import require_same_crs
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.roadgraph import RoadGraph
@@ -39,8 +39,8 @@ logger = logging.getLogger(__name__)
 
 _SPACING = 4.0  # m between the points of a trace
 _LONGEST_STEP = 40.0  # m between two fixes; what lies between two that are farther apart is not known
-_HOLE = 3  # explained points in a row that a run passes over, as where it crosses a road at a flat angle
 _MARGIN = 8  # points before and behind a run that still accompany others
+_HOLE = 3  # explained points in a row that a run passes over, as where it crosses a road at a flat angle
 _COMPANY = 0.9  # share of the points of a run that a trace must have passed to have driven along with it
 _TAKEN = 0.5  # share of the points of a run in the company of others, from which it is no road of its own
 _LOOK = 10_000.0  # m over the graph, up to which a way round is looked for
@@ -54,6 +54,7 @@ class DrivenOptions:
     """Which traces off the graph are a road."""
 
     min_traces: NotNegative[int] = 4  # that drove all along it; 0 adds no road
+    min_share: Share = 0.05  # of the traces at the quieter of its ends, that drive along it; fewer are errors
     radius: Positive[float] = 4.0  # m to an edge that explains a point, and to the points of traces in company
     max_angle: Positive[float] = 20.0  # degrees between the two, as undirected lines
     min_length: Positive[float] = 12.0  # m
@@ -72,6 +73,18 @@ class _Points:
     xy: NDArray[np.float64]  # (P, 2) m
     direction: NDArray[np.float64]  # (P, 2) unit vector
     edge: NDArray[np.int64]  # (P,) row of the edge that explains the point, or -1
+
+
+@dataclass(frozen=True)
+class _Cloud:
+    """Some of the points, to look for near ones."""
+
+    row: NDArray[np.int64]  # (n,) rows of the points
+    tree: cKDTree
+
+    @classmethod
+    def of(cls, points: _Points, row: NDArray[np.int64]) -> _Cloud:
+        return cls(row, cKDTree(points.xy[row]))
 
 
 @dataclass(frozen=True)
@@ -204,42 +217,55 @@ def _bundles(points: _Points, first: NDArray[np.int64], last: NDArray[np.int64],
     near = np.zeros(len(points.trace) + 1, np.int64)
     np.add.at(near, np.maximum(first - _MARGIN, 0), 1)
     np.add.at(near, np.minimum(last + _MARGIN + 1, len(points.trace)), -1)
-    cloud = np.flatnonzero(np.cumsum(near)[:-1] > 0)
-    tree = cKDTree(points.xy[cloud])
+    off = _Cloud.of(points, np.flatnonzero(np.cumsum(near)[:-1] > 0))
+    on = _Cloud.of(points, np.flatnonzero(points.edge >= 0))
     # Runs without enough points of traces near their middle are left out; the place settles the order of equal ones.
     middle = points.xy[(first + last) // 2]
-    crowded = tree.query_ball_point(middle, options.radius, return_length=True) >= options.min_traces
+    crowded = off.tree.query_ball_point(middle, options.radius, return_length=True) >= options.min_traces
     order = np.lexsort([*points.xy[first].T, first - last])
-    taken = np.zeros(len(points.trace), bool)
+    taken, beside = np.zeros(len(points.trace), bool), np.zeros(len(points.trace), bool)
     course, ends = [], []
     for begin, stop in zip(first[order[crowded[order]]], last[order[crowded[order]]], strict=True):
         own = np.arange(begin, stop + 1)
-        if taken[own].mean() > _TAKEN:
+        is_lane = len(own) * _SPACING > options.max_beside and beside[own].mean() > _TAKEN
+        if is_lane or taken[own].mean() > _TAKEN:
             continue
-        at, other = _company(points, cloud, tree, own, options)
-        if pd.unique(points.trace[other]).size < options.min_traces:
+        at, other = _company(points, own, *_alike(points, off, own, options.radius, options.max_angle))
+        traces = pd.unique(points.trace[other]).size
+        passing = min(_passing(points, on, end, options.radius) for end in (begin - 1, stop + 1))
+        if traces < max(options.min_traces, options.min_share * passing):
             continue
         course.append(_middle(points, own, at, other))
         ends.append((begin - 1, stop + 1))
         taken[other] = True
+        beside[_alike(points, off, own, options.beside, options.max_angle)[1]] = True
     return _Bundles(course, np.array(ends, np.int64).reshape(-1, 2))
 
 
-def _company(
-    points: _Points, cloud: NDArray[np.int64], tree: cKDTree, own: NDArray[np.int64], options: DrivenOptions
+def _alike(
+    points: _Points, cloud: _Cloud, own: NDArray[np.int64], radius: float, max_angle: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return pairs of a point of a run, by its number in it, and a near point of a trace that drove along with it.
-
-    ``tree`` holds the points of the cloud.
-    """
-    near = cKDTree(points.xy[own]).sparse_distance_matrix(tree, options.radius, output_type="coo_matrix")
-    at, other = near.row.astype(np.int64), cloud[near.col]
+    """Return pairs of a point of a run, by its number in it, and a near point of a cloud of about its direction."""
+    near = cKDTree(points.xy[own]).sparse_distance_matrix(cloud.tree, radius, output_type="coo_matrix")
+    at, other = near.row.astype(np.int64), cloud.row[near.col]
     cosine = np.abs((points.direction[own[at]] * points.direction[other]).sum(axis=1))
-    alike = cosine >= np.cos(np.radians(options.max_angle))
-    at, other = at[alike], other[alike]
+    alike = cosine >= np.cos(np.radians(max_angle))
+    return at[alike], other[alike]
+
+
+def _company(
+    points: _Points, own: NDArray[np.int64], at: NDArray[np.int64], other: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Keep the pairs with traces that drove all along with a run."""
     passed = pd.DataFrame({"trace": points.trace[other], "at": at}).drop_duplicates()["trace"].value_counts()
     along = np.isin(points.trace[other], passed.index[passed >= _COMPANY * len(own)])
     return at[along], other[along]
+
+
+def _passing(points: _Points, on: _Cloud, end: int, radius: float) -> int:
+    """Count the traces that passed an explained point on its edge, given all that are explained."""
+    near = on.row[on.tree.query_ball_point(points.xy[end], 2 * radius)]
+    return pd.unique(points.trace[near[points.edge[near] == points.edge[end]]]).size
 
 
 def _middle(
