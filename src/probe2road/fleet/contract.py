@@ -15,20 +15,9 @@ from pyproj import CRS
 from probe2road.bounds import NotNegative, Positive
 from probe2road.crs import WGS84, is_true_to_scale, local_crs, parse_crs, require_metric, transform, turn_headings
 from probe2road.errors import CRSError, InputError, OptionError
-from probe2road.fleet.outliers import (
-    OutlierOptions,
-    main_area,
-    without_impossible_fixes,
-    without_impossible_points,
-)
-from probe2road.fleet.tables import (
-    POINT_KINDS,
-    check_points,
-    check_traces,
-    empty_points,
-    run_starts,
-    sort_fixes,
-)
+from probe2road.fleet.columns import POINT_KINDS
+from probe2road.fleet.outliers import OutlierOptions, main_area, without_impossible_fixes, without_impossible_points
+from probe2road.fleet.tables import check_points, check_traces, empty_points, run_starts, sort_fixes
 from probe2road.notebook import figures_table
 from probe2road.options import checked
 
