@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 
 from probe2road.crs import parse_crs
+from probe2road.fleet.columns import POINT_KINDS
 from probe2road.fleet.contract import Fleet, trace_breaks
-from probe2road.fleet.tables import POINT_KINDS
 from probe2road.raster.counts import fleet_grid, rasterize
 
 FIXES_PER_DRIVE = 500

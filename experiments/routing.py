@@ -81,7 +81,7 @@ def lengths(graph: RoadGraph, places: NDArray[np.float64], engine: str, osm: Osm
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "roads.osm.pbf")
         write_graph(graph, path, osm=osm)
-        with ENGINES[engine](path, Path(folder)) as route:
+        with ENGINES[engine](path) as route:
             ways = [route(pair) for pair in places]
     return np.array([np.nan if way is None else way.length for way in ways])
 

@@ -58,7 +58,7 @@ def route(
     write_graph(graph, folder / "roads.osm.pbf")
     with ExitStack() as stack:
         try:
-            router = stack.enter_context(ENGINES[request.param](folder / "roads.osm.pbf", folder))
+            router = stack.enter_context(ENGINES[request.param](folder / "roads.osm.pbf"))
         except (MissingExtraError, FileNotFoundError) as error:
             pytest.skip(str(error))
         yield router

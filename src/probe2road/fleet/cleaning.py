@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from probe2road.errors import InputError
-from probe2road.fleet.tables import TableOrigin
+from probe2road.fleet.faults import TableOrigin
 
 if TYPE_CHECKING:
     from probe2road.fleet.contract import Fleet

@@ -15,20 +15,9 @@ from pyproj import CRS
 from probe2road.bounds import NotNegative, Positive
 from probe2road.crs import WGS84, is_true_to_scale, local_crs, parse_crs, require_metric, transform, turn_headings
 from probe2road.errors import CRSError, InputError, OptionError
-from probe2road.fleet.outliers import (
-    OutlierOptions,
-    main_area,
-    without_impossible_fixes,
-    without_impossible_points,
-)
-from probe2road.fleet.tables import (
-    POINT_KINDS,
-    check_points,
-    check_traces,
-    empty_points,
-    run_starts,
-    sort_fixes,
-)
+from probe2road.fleet.columns import POINT_KINDS
+from probe2road.fleet.outliers import OutlierOptions, main_area, without_impossible_fixes, without_impossible_points
+from probe2road.fleet.tables import check_points, check_traces, empty_points, run_starts, sort_fixes
 from probe2road.notebook import figures_table
 from probe2road.options import checked
 
@@ -156,6 +145,17 @@ class TraceGaps:
     step_factor: NotNegative[float] = 3.0  # x the trace's median moving step, where that is more than max_step
     max_speed: Positive[float] = 70.0  # m/s; a faster step is a jump of the position, not driving
 
+    def too_fast(self, step: NDArray[np.float64], seconds: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell which steps (m) no vehicle drives in so many seconds; clocks are true to a second. NaN says nothing.
+
+        Examples
+        --------
+        >>> TraceGaps().too_fast(np.array([60.0, 90.0, 90.0]), np.array([0.1, 0.1, np.nan])).tolist()
+        [False, True, False]
+        """
+        with np.errstate(invalid="ignore"):
+            return np.asarray(step > self.max_speed * np.maximum(seconds, 1.0), bool)
+
 
 def trace_breaks(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool_]:
     """Mark the fixes that are not connected to the fix before.
@@ -201,8 +201,7 @@ def trace_breaks(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool
     with np.errstate(invalid="ignore"):
         late = (interval > interval_limit[owner]) & (step > gaps.standing_step)
         breaks |= within & (late | (step > step_limit[owner]))
-        breaks |= within & (step > gaps.max_speed * np.maximum(step_seconds(fleet, gaps), 1.0))
-    return breaks
+    return breaks | (within & gaps.too_fast(step, step_seconds(fleet, gaps)))
 
 
 def times_left(fleet: Fleet, gaps: TraceGaps) -> NDArray[np.datetime64]:

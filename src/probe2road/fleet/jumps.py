@@ -48,11 +48,10 @@ def position_jumps(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bo
     gaps = gaps or TraceGaps()
     step = np.hypot(*(np.diff(fleet.traces[axis].to_numpy(), prepend=np.nan) for axis in "xy"))
     seconds = step_seconds(fleet, gaps)
-    with np.errstate(invalid="ignore"):
-        fast = step > gaps.max_speed * np.maximum(seconds, 1.0)
-    jumps = np.where(np.isnan(seconds), trace_breaks(fleet, gaps), fast)
-    jumps[fleet.starts[:-1]] = False
-    return jumps
+    within = np.ones(len(step), bool)
+    within[fleet.starts[:-1]] = False
+    jumps, clockless = within & gaps.too_fast(step, seconds), within & np.isnan(seconds)
+    return jumps | (clockless & trace_breaks(fleet, gaps)) if clockless.any() else jumps
 
 
 def stray_fixes(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool_]:
@@ -93,8 +92,7 @@ def stray_fixes(fleet: Fleet, gaps: TraceGaps | None = None) -> NDArray[np.bool_
         """Tell whether no vehicle can have driven from the one fix to the other."""
         step = np.hypot(x[second] - x[first], y[second] - y[first])
         seconds = (time[second] - left[first]) / np.timedelta64(1, "s")
-        with np.errstate(invalid="ignore"):
-            return np.where(np.isnan(seconds), step > gaps.max_step, step > gaps.max_speed * np.maximum(seconds, 1.0))
+        return np.where(np.isnan(seconds), step > gaps.max_step, gaps.too_fast(step, seconds))
 
     inside = np.arange(1, len(x))
     inside = inside[fleet.owner[1:] == fleet.owner[:-1]]

@@ -7,8 +7,7 @@ fault. What can be repaired without losing information (row order, exact duplica
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,104 +16,34 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from probe2road.crs import WGS84, transform
+from probe2road.fleet.columns import (
+    POINT_COLUMNS,
+    POINT_KINDS,
+    POINT_OPTIONAL_COLUMNS,
+    TIME_DTYPE,
+    TRACE_COLUMNS,
+    TRACE_OPTIONAL_COLUMNS,
+    coordinates,
+    identifiers,
+    measured,
+    point_kinds,
+    timestamps,
+    unknown_times,
+)
+from probe2road.fleet.faults import TableChecks, TableOrigin, few, may_leave_out
 
-__all__ = [
-    "MISSING_WORDS",
-    "POINT_COLUMNS",
-    "POINT_KINDS",
-    "POINT_OPTIONAL_COLUMNS",
-    "TIME_DTYPE",
-    "TRACE_COLUMNS",
-    "TRACE_OPTIONAL_COLUMNS",
-    "TableOrigin",
-    "check_points",
-    "check_traces",
-    "empty_points",
-    "may_leave_out",
-    "run_starts",
-    "sort_fixes",
-]
+__all__ = ["check_points", "check_traces", "empty_points", "run_starts", "sort_fixes"]
 
 logger = logging.getLogger(__name__)
 
-POINT_KINDS = ("lane_marking", "road_boundary")
-TRACE_COLUMNS = ("trace_id", "t", "x", "y", "z")
-TRACE_OPTIONAL_COLUMNS = ("vehicle_id", "heading", "speed", "accuracy")
-POINT_COLUMNS = ("trace_id", "t", "x", "y", "z", "kind")
-POINT_OPTIONAL_COLUMNS = ("accuracy",)
-TIME_DTYPE = "datetime64[ns, UTC]"
-
-# What databases and spreadsheets write where there is nothing, in lower case.
-MISSING_WORDS = ("", "nan", "null", "none", "na", "n/a", "nat", "<na>", "\\n", "-", "--", "?")
 
 _MAY_BE_ABSENT = ("t", "z")  # data without clock, 2-D data
-_SHARE_LEFT_OUT = 0.05  # of the rows of a file that may be left out unasked
-_EXAMPLES_SHOWN = 3  # offending rows named in a fault
-_MOST_SECONDS = 9.2e9  # since 1970; a time in nanoseconds holds no more
-_FIRST_TIME, _LAST_TIME = (limit.tz_localize("UTC") for limit in (pd.Timestamp(1678, 1, 1), pd.Timestamp(2262, 1, 1)))
-_LONGEST_VALUE = 40  # characters of a value that a message shows
 _SAME_PLACE = 0.01  # m; repeated fixes at one instant nearer than this are one fix
 _DEGREES_PER_METRE = 1e-5  # of latitude, rounded up
 _POLAR = 80.0  # degrees of latitude beyond which swapped columns are likelier than roads
 _SWAPPED = "; longitude and latitude look swapped"
 _SPREAD_OF_DEGREES = 5.0  # a projected data set that spans less than this near the origin is in degrees
 _FAR_FROM_CRS = 20.0  # degrees outside the area of use of a CRS, beyond which the CRS is wrong
-
-
-@dataclass(frozen=True)
-class TableOrigin:
-    """Where a table came from, in the words of its author, for messages."""
-
-    name: str = "traces"  # what is in the table
-    row_word: str = "row"  # "line" for text files
-    first_row: int = 0  # number of the table's first row in those words
-    columns: Mapping[str, str] = field(default_factory=dict)  # our column name -> the author's
-    by_name: Collection[str] = ()  # our columns that were taken for their usual names alone, not named by the user
-
-    def column(self, ours: str) -> str:
-        """Return the name of one of our columns for a message."""
-        theirs = self.columns.get(ours, ours)
-        return repr(ours) if theirs == ours else f"{theirs!r} ({ours})"
-
-    def rows(self, mask: NDArray[np.bool_], values: Any) -> str:
-        """Return as text how many rows a mask selects, and the first few of them."""
-        rows = np.flatnonzero(mask)
-        values = np.asarray(pd.Series(values).iloc[rows[:_EXAMPLES_SHOWN]])
-        shown = ", ".join(
-            f"{self.row_word} {row + self.first_row}: {_brief(value)}" for row, value in zip(rows, values, strict=False)
-        )
-        return f"{len(rows)} of {len(mask)} rows ({shown}{', ...' if len(rows) > _EXAMPLES_SHOWN else ''})"
-
-
-class _Checks:
-    """The faults found in one table: those of the whole table, and rows that can be left out."""
-
-    def __init__(self, origin: TableOrigin, faults: list[str]) -> None:
-        self.origin, self.faults = origin, faults
-        self.rows: list[tuple[str, NDArray[np.bool_]]] = []
-
-    def name(self, ours: str) -> str:
-        """Return the name of a column for the start of a fault."""
-        return f"{self.origin.name}: column {self.origin.column(ours)}"
-
-    def fault(self, fault: str) -> None:
-        """Add a fault of the table."""
-        self.faults.append(fault)
-
-    def row_fault(self, fault: str, mask: NDArray[np.bool_]) -> None:
-        """Add a fault of some rows."""
-        self.rows.append((fault, mask))
-
-
-def may_leave_out(n_bad: int, n_rows: int, invalid: str | None) -> bool:
-    """Tell whether bad rows are left out: ``"drop"``, ``"refuse"``, or None for up to 5 % of them.
-
-    Examples
-    --------
-    >>> may_leave_out(5, 100, None), may_leave_out(6, 100, None), may_leave_out(6, 100, "drop")
-    (True, False, True)
-    """
-    return invalid == "drop" or (invalid is None and n_bad <= _SHARE_LEFT_OUT * n_rows)
 
 
 def check_traces(
@@ -211,7 +140,7 @@ def sort_fixes(traces: pd.DataFrame, crs: CRS, faults: list[str], *, invalid: st
     if disagree.any():
         what = (
             f"{int(disagree.sum())} fixes repeat the time of the fix before at another place "
-            f"(trace {_few(traces['trace_id'][disagree].unique())})"
+            f"(trace {few(traces['trace_id'][disagree].unique())})"
         )
         if not may_leave_out(int(disagree.sum()), len(traces), invalid):
             fix = 'use finer time stamps, or one trace_id per drive, or leave the later ones out with invalid="drop"'
@@ -250,7 +179,7 @@ def _with_whole_clocks(traces: pd.DataFrame, faults: list[str], invalid: str | N
     if partly.empty:
         return traces
     bad = (untimed & traces["trace_id"].isin(partly.index)).to_numpy(bool)
-    what = f"some fixes of {len(partly)} traces have no time ({_few(partly.index)})"
+    what = f"some fixes of {len(partly)} traces have no time ({few(partly.index)})"
     if not may_leave_out(int(bad.sum()), len(traces), invalid):
         faults.append(f'traces: {what}; drop those fixes, for example with invalid="drop"')
         return traces
@@ -276,9 +205,9 @@ def _checked(
         faults.append(f"{origin.name}: no rows")
     if len(faults) > known:
         return table
-    checks = _Checks(origin, faults)
-    result: dict[str, Any] = {"trace_id": _identifiers(table["trace_id"], checks)}
-    result["t"] = _timestamps(table["t"], checks) if "t" in table else _no_times(len(table))
+    checks = TableChecks(origin, faults)
+    result: dict[str, Any] = {"trace_id": identifiers(table["trace_id"], checks)}
+    result["t"] = timestamps(table["t"], checks) if "t" in table else unknown_times(len(table))
     for name in ("x", "y", "z", *optional):
         if name not in table:
             if name in needed:
@@ -286,13 +215,13 @@ def _checked(
         elif name == "vehicle_id":
             result[name] = table[name].array
         elif name in ("x", "y"):
-            result[name] = _coordinates(table[name], checks)
+            result[name] = coordinates(table[name], checks)
         else:
-            values = _measured(table[name], checks, invalid)
+            values = measured(table[name], checks, invalid)
             if values is not None or name in needed:
                 result[name] = np.full(len(table), np.nan) if values is None else values
     if "kind" in needed:
-        result["kind"] = _kinds(table["kind"], checks)
+        result["kind"] = point_kinds(table["kind"], checks)
     if crs.is_geographic and len(faults) == known:
         _degree_faults(result["x"], result["y"], checks)
     keep = _rows_to_keep(len(table), checks, invalid, complain=len(faults) == known)
@@ -306,7 +235,7 @@ def _checked(
     return checked
 
 
-def _rows_to_keep(n: int, checks: _Checks, invalid: str | None, *, complain: bool) -> NDArray[np.bool_]:
+def _rows_to_keep(n: int, checks: TableChecks, invalid: str | None, *, complain: bool) -> NDArray[np.bool_]:
     """Mark the rows that are kept; if too many would be left out, their faults become faults of the table."""
     keep = np.ones(n, bool)
     for _, mask in checks.rows:
@@ -324,142 +253,7 @@ def _rows_to_keep(n: int, checks: _Checks, invalid: str | None, *, complain: boo
     return np.ones(n, bool)
 
 
-def _identifiers(ids: pd.Series, checks: _Checks) -> Any:
-    """Check trace ids for missing values, and convert mixed types and bytes to text, so that they can be sorted."""
-    name = checks.name("trace_id")
-    empty = ids.isna().to_numpy()
-    if pd.api.types.is_string_dtype(ids.dtype) and not pd.api.types.is_object_dtype(ids.dtype):
-        empty = empty | (ids == "").to_numpy(bool, na_value=False)
-    if empty.any():
-        checks.row_fault(f"{name} is empty in {int(empty.sum())} of {len(ids)} rows", empty)
-    if isinstance(ids.dtype, pd.CategoricalDtype) and not empty.any():
-        ids = ids.astype(ids.cat.categories.dtype)
-    if not pd.api.types.is_object_dtype(ids.dtype):
-        return ids.array
-    try:
-        codes, found = pd.factorize(ids)
-    except TypeError:  # lists and the like
-        checks.fault(f"{name} holds neither text nor numbers")
-        return ids.array
-    words = [value.hex() if isinstance(value, bytes) else str(value) for value in found]
-    return pd.array([*words, None], dtype="str").take(codes)
-
-
-def _coordinates(values: pd.Series, checks: _Checks) -> NDArray[np.float64]:
-    """Convert a column of coordinates to float64; rows without one are bad."""
-    name = checks.name(str(values.name))
-    if not _may_hold_numbers(values):
-        checks.fault(f"{name} holds {values.dtype}, not numbers")
-        return np.full(len(values), np.nan)
-    numbers, words, unreadable = _numbers(values)
-    if unreadable.any():
-        comma = words[unreadable].str.fullmatch(r"[+-]?\d+,\d+").all()
-        hint = "; decimal commas are not read, use points" if comma else ""
-        checks.row_fault(f"{name} is not a number in {checks.origin.rows(unreadable, words)}{hint}", unreadable)
-    missing = ~np.isfinite(numbers) & ~unreadable
-    if missing.any():
-        checks.row_fault(f"{name} is empty or not finite in {checks.origin.rows(missing, numbers)}", missing)
-    return numbers
-
-
-def _measured(values: pd.Series, checks: _Checks, invalid: str | None) -> NDArray[np.float64] | None:
-    """Convert a column that may be absent to float64; unreadable cells are unknown, None if it is to be left out."""
-    ours = str(values.name)
-    name, by_name = checks.name(ours), ours in checks.origin.by_name
-    remedy = f'leave the column out with {"point_" * (checks.origin.name == "points")}columns={{"{ours}": ""}}'
-    if not _may_hold_numbers(values):
-        fault = f"{name} holds {values.dtype}, not numbers"
-    else:
-        numbers, words, unreadable = _numbers(values)
-        if not unreadable.any():
-            return numbers
-        fault = f"{name} is not a number in {checks.origin.rows(unreadable, words)}"
-        if may_leave_out(int(unreadable.sum()), len(values), invalid):
-            logger.warning("%s: taken as unknown", fault)
-            return numbers
-    if by_name:
-        logger.warning("%s: the column is left out", fault)
-    else:
-        checks.fault(f"{fault}; {remedy}")
-    return None
-
-
-def _may_hold_numbers(values: pd.Series) -> bool:
-    """Tell whether a column has a type in which numbers can be written."""
-    return _is_plain_numeric(values) or values.dtype.kind not in "bmM"
-
-
-def _numbers(values: pd.Series) -> tuple[NDArray[np.float64], pd.Series, NDArray[np.bool_]]:
-    """Convert a column to float64: the numbers, the column as text, and where that is neither empty nor a number."""
-    if _is_plain_numeric(values):
-        return values.to_numpy(dtype=np.float64, na_value=np.nan), values, np.zeros(len(values), bool)
-    words = values.astype(object).map(str, na_action="ignore").str.strip()
-    numbers = pd.to_numeric(words, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
-    missing = (words.isna() | words.str.lower().isin(MISSING_WORDS)).to_numpy(bool)
-    return numbers, words, np.isnan(numbers) & ~missing
-
-
-def _is_plain_numeric(values: pd.Series) -> bool:
-    return bool(pd.api.types.is_numeric_dtype(values.dtype) and values.dtype.kind != "b")
-
-
-def _timestamps(values: pd.Series, checks: _Checks) -> pd.Series:
-    """Convert a column to UTC timestamps: numbers are seconds since 1970, text is ISO 8601, naive is UTC."""
-    name = checks.name("t")
-    if values.dtype.kind in "bm":
-        checks.fault(f"{name} holds {values.dtype}, not times")
-        return _no_times(len(values))
-    if _is_plain_numeric(values):
-        return _times_of_seconds(values, checks)
-    is_time = pd.api.types.is_datetime64_any_dtype(values.dtype)
-    if not is_time and not isinstance(values.dtype, pd.CategoricalDtype):
-        missing = values.isin([*MISSING_WORDS, "NULL", "\\N", "NaN", "None", "NA", "N/A"]).to_numpy(bool)
-        values = values.mask(missing) if missing.any() else values
-    times = pd.to_datetime(values, utc=True, errors="coerce", format=None if is_time else "ISO8601")
-    unreadable = (times.isna() & values.notna()).to_numpy()
-    if unreadable.any():
-        rows = checks.origin.rows(unreadable, values)
-        checks.row_fault(f"{name} is not a time in {rows}; use ISO 8601 or seconds since 1970", unreadable)
-    times = times.reset_index(drop=True)
-    beyond = ((times < _FIRST_TIME) | (times > _LAST_TIME)).to_numpy(bool)
-    if beyond.any():
-        rows = checks.origin.rows(beyond, values)
-        checks.row_fault(f"{name} is outside the years {_FIRST_TIME.year}..{_LAST_TIME.year} in {rows}", beyond)
-        times = times.mask(beyond)
-    return times.astype(TIME_DTYPE)
-
-
-def _times_of_seconds(values: pd.Series, checks: _Checks) -> pd.Series:
-    """Convert seconds since 1970 to UTC timestamps; numbers too large for one are bad."""
-    seconds = values.to_numpy(dtype=np.float64, na_value=np.nan)
-    beyond = np.abs(seconds) >= _MOST_SECONDS
-    if beyond.any():
-        largest = float(np.nanmax(np.abs(seconds)))
-        name = f"{checks.name('t')} is not in seconds since 1970 (largest value {largest:.6g})"
-        checks.row_fault(f"{name} in {checks.origin.rows(beyond, seconds)}", beyond)
-        seconds = np.where(beyond, np.nan, seconds)
-    # A float64 holds the seconds of this century to a microsecond at best: do not invent nanoseconds.
-    microseconds = np.round(np.nan_to_num(seconds) * 1e6).astype(np.int64)
-    nanoseconds = np.where(np.isnan(seconds), np.iinfo(np.int64).min, microseconds * 1000)
-    return pd.Series(nanoseconds.view("datetime64[ns]")).dt.tz_localize("UTC")
-
-
-def _no_times(n: int) -> pd.Series:
-    """Return an array of n missing times."""
-    return pd.Series(np.full(n, np.datetime64("NaT", "ns"))).dt.tz_localize("UTC")
-
-
-def _kinds(values: pd.Series, checks: _Checks) -> pd.Categorical:
-    """Convert a column to the categories of semantic points, or report the values that are no category."""
-    codes, found = pd.factorize(values, use_na_sentinel=False)
-    unknown = [str(kind) for kind in found if kind not in POINT_KINDS]
-    if unknown:
-        checks.fault(f"{checks.name('kind')} is one of {', '.join(POINT_KINDS)}, not {_few(unknown)}")
-    position = np.array([POINT_KINDS.index(kind) if kind in POINT_KINDS else -1 for kind in found], np.int8)
-    return pd.Categorical.from_codes(position[codes], categories=POINT_KINDS)
-
-
-def _degree_faults(lon: NDArray[np.float64], lat: NDArray[np.float64], checks: _Checks) -> None:
+def _degree_faults(lon: NDArray[np.float64], lat: NDArray[np.float64], checks: TableChecks) -> None:
     """Report longitudes and latitudes that are out of range, and whether the two axes look swapped."""
     if not (np.isfinite(lon).any() and np.isfinite(lat).any()):
         return
@@ -531,15 +325,3 @@ def _codes(ids: pd.Series) -> NDArray[np.int64]:
     starts = run_starts(ids)
     codes, _ = pd.factorize(ids.iloc[starts[:-1]], sort=True)
     return np.repeat(codes.astype(np.int64), np.diff(starts))
-
-
-def _few(values: Any) -> str:
-    """Return the first few values as text."""
-    values = list(values)
-    return ", ".join(map(_brief, values[:_EXAMPLES_SHOWN])) + (", ..." if len(values) > _EXAMPLES_SHOWN else "")
-
-
-def _brief(value: Any) -> str:
-    """Return a value as text for a message, shortened if it is long."""
-    text = str(value)
-    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."

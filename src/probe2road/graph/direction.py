@@ -188,7 +188,7 @@ def counted_direction(edges: pd.DataFrame, *, options: DirectionOptions | None =
     return best.mask((probability.max(axis=1) < options.min_confidence) | (forward + backward == 0))
 
 
-def driving_direction(edges: pd.DataFrame) -> pd.Series:
+def driving_direction(edges: pd.DataFrame, *, options: DirectionOptions | None = None) -> pd.Series:
     """Return the driving direction of each edge: 1 from u to v only, -1 from v to u only, 0 for both.
 
     The column ``oneway`` decides where it says something (see `told_direction`): it holds what a map says, or what
@@ -200,6 +200,8 @@ def driving_direction(edges: pd.DataFrame) -> pd.Series:
     ----------
     edges
         Edge table of a graph.
+    options
+        When counts decide; None takes the defaults.
 
     Returns
     -------
@@ -215,7 +217,7 @@ def driving_direction(edges: pd.DataFrame) -> pd.Series:
     >>> driving_direction(edges.assign(oneway=["no", None, "yes"])).tolist()
     [0, -1, 1]
     """
-    direction = counted_direction(edges)
+    direction = counted_direction(edges, options=options)
     if "oneway_confidence" in edges:
         direction = direction.mask(edges["oneway_confidence"].notna())
     if "oneway" in edges:

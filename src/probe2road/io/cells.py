@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from probe2road.errors import InputError
-from probe2road.fleet.tables import TableOrigin
+from probe2road.fleet.faults import TableOrigin
 from probe2road.io.angles import degrees_of_column, hidden_unit
 from probe2road.io.clocks import times_of_column
 from probe2road.io.columns import ColumnChoice, standard_kinds

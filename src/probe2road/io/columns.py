@@ -16,7 +16,7 @@ import pandas as pd
 from pyproj import CRS
 
 from probe2road.errors import InputError, OptionError
-from probe2road.fleet.tables import (
+from probe2road.fleet.columns import (
     POINT_COLUMNS,
     POINT_KINDS,
     POINT_OPTIONAL_COLUMNS,

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.csv
 
 from probe2road.errors import InputError
-from probe2road.fleet.tables import TableOrigin, may_leave_out
+from probe2road.fleet.faults import TableOrigin, may_leave_out
 from probe2road.io.cells import raw_table
 from probe2road.io.columns import ColumnChoice, choose_columns
 from probe2road.io.compressed import unpacked

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from probe2road.crs import WGS84, transform
+from probe2road.fleet.columns import POINT_KINDS
 from probe2road.fleet.contract import Fleet, TraceGaps, trace_breaks
 from probe2road.fleet.jumps import without_strays
-from probe2road.fleet.tables import POINT_KINDS
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.io.fleet_reader import read_fleet
 from probe2road.io.formats import FleetFormat, GraphFormat

@@ -17,7 +17,8 @@ from probe2road.crs import WGS84, same_crs
 from probe2road.errors import CRSError, InputError
 from probe2road.fleet.cleaning import BY_VEHICLE, ENTERS, accurate_fixes, plausible_headings, tidied
 from probe2road.fleet.contract import Fleet, fleet_from_checked
-from probe2road.fleet.tables import TableOrigin, check_points, check_traces
+from probe2road.fleet.faults import TableOrigin
+from probe2road.fleet.tables import check_points, check_traces
 from probe2road.fleet.trimming import trim_ends
 from probe2road.io.atomic import settled
 from probe2road.io.clocks import FIRST_YEAR, LAST_YEAR

@@ -17,7 +17,7 @@ import pandas as pd
 
 from probe2road.crs import WGS84
 from probe2road.errors import InputError
-from probe2road.fleet.tables import TableOrigin
+from probe2road.fleet.faults import TableOrigin
 from probe2road.io.compressed import unpacked
 from probe2road.io.sources import RawTable, SourceFile
 

@@ -9,7 +9,7 @@ import pyogrio
 
 from probe2road.crs import parse_crs
 from probe2road.errors import InputError
-from probe2road.fleet.tables import TableOrigin
+from probe2road.fleet.faults import TableOrigin
 from probe2road.io.cells import raw_table
 from probe2road.io.columns import choose_columns
 from probe2road.io.formats import FleetFormat

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from probe2road.crs import WGS84
 from probe2road.errors import InputError
-from probe2road.fleet.tables import TableOrigin
+from probe2road.fleet.faults import TableOrigin
 from probe2road.io.angles import degrees_and_minutes, degrees_of_column
 from probe2road.io.compressed import unpacked
 from probe2road.io.guard import parsing

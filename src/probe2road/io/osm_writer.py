@@ -34,13 +34,7 @@ from numpy.typing import NDArray
 from probe2road.bounds import Positive
 from probe2road.crs import WGS84, crs_to_text, transform
 from probe2road.errors import OptionError
-from probe2road.graph.direction import (
-    ONEWAY_TAGS,
-    DirectionOptions,
-    counted_direction,
-    driving_direction,
-    told_direction,
-)
+from probe2road.graph.direction import ONEWAY_TAGS, DirectionOptions, driving_direction
 from probe2road.graph.levels import crossing_layers
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import edges_with_turns
@@ -198,9 +192,8 @@ def _way_tags(graph: RoadGraph, *, router: bool) -> list[dict[str, str]]:
 
 def _probable_direction(edges: pd.DataFrame) -> pd.Series:
     """Return the driving direction of each edge, the more probable one where too few drives were seen to be sure."""
-    counted = counted_direction(edges, options=DirectionOptions(min_confidence=0.5))
-    told = told_direction(edges["oneway"]) if "oneway" in edges else pd.Series(pd.NA, edges.index, dtype="Int64")
-    return told.fillna(counted).fillna(0).astype("int64")
+    unweighed = edges.drop(columns="oneway_confidence", errors="ignore")  # which would keep open what was left open
+    return driving_direction(unweighed, options=DirectionOptions(min_confidence=0.5))
 
 
 def _seen_tags(graph: RoadGraph) -> dict[str, NDArray[np.object_]]:
@@ -217,27 +210,15 @@ def _restrictions(graph: RoadGraph, options: OsmOptions) -> list[tuple[int, int,
     """Return the rows of the first edge, of the node and of the second edge of each forbidden turn, and its kind."""
     turns = untaken_turns(graph, min_expected=options.min_expected)
     start, end = (graph.edges.index.get_indexer(turns[name]) for name in ("from_edge", "to_edge"))
-    via = np.searchsorted(_used_nodes(graph), turns["via_node"])
     node = turns["via_node"].to_numpy()
-    turned = np.degrees(_course(graph, end, node, leaving=True) - _course(graph, start, node, leaving=False))
-    turned = (turned + 180.0) % 360.0 - 180.0  # to the left
+    via = np.searchsorted(_used_nodes(graph), node)
+    at_stop = graph.edges["u"].to_numpy()[[start, end]] != node
+    back, on = graph.ends(reach=_COURSE).ahead[2 * np.stack([start, end]) + at_stop]
+    aside = on[:, 0] * back[:, 1] - on[:, 1] * back[:, 0]
+    turned = np.degrees(np.arctan2(aside, -(on * back).sum(axis=1)))  # to the left
     kinds = np.select(
         [np.abs(turned) <= _STRAIGHT, np.abs(turned) >= _BACK, turned > 0],
         ["no_straight_on", "no_u_turn", "no_left_turn"],
         "no_right_turn",
     )
     return list(zip(start.tolist(), via.tolist(), end.tolist(), kinds.tolist(), strict=True))
-
-
-def _course(
-    graph: RoadGraph, rows: NDArray[np.int64], nodes: NDArray[np.int64], *, leaving: bool
-) -> NDArray[np.float64]:
-    """Return the direction in which edges are driven where they leave a node or arrive at it, radians, shape (n,)."""
-    edges = graph.edges.iloc[rows]
-    at_start = edges["u"].to_numpy() == nodes
-    lines = edges.geometry.to_numpy()
-    away = np.where(at_start, _COURSE, -_COURSE)
-    near = np.where(at_start, 0.0, shapely.length(lines))
-    there, here = (shapely.get_coordinates(shapely.line_interpolate_point(lines, at)) for at in (near + away, near))
-    step = there - here if leaving else here - there
-    return np.arctan2(step[:, 1], step[:, 0])

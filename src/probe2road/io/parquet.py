@@ -15,7 +15,7 @@ from pyproj import CRS
 
 from probe2road.crs import parse_crs
 from probe2road.errors import InputError
-from probe2road.fleet.tables import TableOrigin
+from probe2road.fleet.faults import TableOrigin
 from probe2road.io.cells import raw_table
 from probe2road.io.columns import ColumnChoice, choose_columns
 from probe2road.io.formats import BBox, FleetFormat

@@ -15,7 +15,7 @@ import pyarrow.csv
 
 from probe2road.crs import WGS84
 from probe2road.errors import InputError
-from probe2road.fleet.tables import TableOrigin, may_leave_out
+from probe2road.fleet.faults import TableOrigin, may_leave_out
 from probe2road.io.compressed import unpacked
 from probe2road.io.guard import parsing
 from probe2road.io.sources import RawTable, SourceFile

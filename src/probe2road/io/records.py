@@ -13,7 +13,7 @@ import pandas as pd
 import pyarrow as pa
 
 from probe2road.errors import InputError
-from probe2road.fleet.tables import TableOrigin
+from probe2road.fleet.faults import TableOrigin
 from probe2road.io.cells import raw_table
 from probe2road.io.columns import choose_columns
 from probe2road.io.compressed import unpacked

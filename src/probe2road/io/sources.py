@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from probe2road.errors import InputError, MissingFileError
-from probe2road.fleet.tables import TableOrigin
+from probe2road.fleet.faults import TableOrigin
 from probe2road.io.atomic import settled
 from probe2road.io.compressed import unpacked
 

@@ -11,10 +11,7 @@ import importlib.util
 import json
 import logging
 import os
-import socket
-import subprocess
 import tempfile
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator, Mapping
@@ -30,21 +27,20 @@ from numpy.typing import NDArray
 
 from probe2road.bounds import NotNegative, Positive, Share
 from probe2road.crs import WGS84, transform
-from probe2road.errors import InputError, MissingExtraError, OptionError, Probe2RoadError
+from probe2road.errors import InputError, MissingExtraError, OptionError
 from probe2road.fleet.contract import Fleet
 from probe2road.graph.direction import driving_direction
 from probe2road.graph.roadgraph import RoadGraph
 from probe2road.matching.frame import courses, edge_lines, stations_along
+from probe2road.matching.servers import free_port, run_program, served
 from probe2road.options import checked
 
-__all__ = ["OsrmNetwork", "OsrmOptions", "find_osrm", "osrm_network", "osrm_segments", "osrm_server"]
+__all__ = ["OsrmNetwork", "OsrmOptions", "find_osrm", "osrm_network", "osrm_segments", "osrm_server", "serve_osm"]
 
 logger = logging.getLogger(__name__)
 
 _FOLDER = "PROBE2ROAD_OSRM"  # environment variable
-_TOOLS = ("osrm-extract", "osrm-partition", "osrm-customize", "osrm-routed")
 _DECIMALS = 7  # decimals of a degree in OSM files
-_START = 30.0  # s that a server may take to answer
 
 
 @dataclass(frozen=True)
@@ -194,25 +190,44 @@ def osrm_server(network: OsrmNetwork, *, folder: str | Path | None = None) -> It
     with tempfile.TemporaryDirectory(prefix="probe2road-osrm-") as temporary:
         source = Path(temporary) / "network.osm.pbf"
         _write_network(network, source)
-        base = source.with_name("network.osrm")
-        profile = home / "share" / "profiles" / "car.lua"
-        _run(home, "osrm-extract", "--threads", "1", "--profile", str(profile), str(source))
-        for tool in _TOOLS[1:3]:
-            _run(home, tool, "--threads", "1", str(base))
-        port = _free_port()
-        command = [
-            str(home / "bin" / "osrm-routed"), "--algorithm", "mld", "--ip", "127.0.0.1", "--port", str(port),
-            "--threads", "1", "--max-matching-size", "100000", str(base),
-        ]  # fmt: skip
-        log = Path(temporary) / "routed.log"
-        with log.open("wb") as output:
-            server = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
-        try:
-            _wait_for(server, port, log)
-            yield f"http://127.0.0.1:{port}"
-        finally:
-            server.terminate()
-            server.wait()
+        with serve_osm(source, folder=home) as url:
+            yield url
+
+
+@contextmanager
+def serve_osm(source: Path, *, folder: str | Path | None = None) -> Iterator[str]:
+    """Prepare an OSM file for OSRM's profile for cars, and serve it on this machine until the context ends.
+
+    Parameters
+    ----------
+    source
+        File with the suffix ``.osm.pbf``; what OSRM makes of it is written beside it.
+    folder
+        Where OSRM is; see `find_osrm`.
+
+    Yields
+    ------
+    str
+        Address of the server.
+
+    Raises
+    ------
+    MissingExtraError
+        If OSRM is not installed.
+    Probe2RoadError
+        If one of its programs fails, with the last line it printed.
+    """
+    home = find_osrm(folder)
+    base = source.with_name(source.name.removesuffix(".osm.pbf") + ".osrm")
+    profile = home / "share" / "profiles" / "car.lua"
+    run_program(home / "bin" / "osrm-extract", "--threads", "1", "--profile", profile, source, where="OSRM")
+    for tool in ("osrm-partition", "osrm-customize"):
+        run_program(home / "bin" / tool, "--threads", "1", base, where="OSRM")
+    port = free_port()
+    words = ["--algorithm", "mld", "--ip", "127.0.0.1", "--port", str(port), "--threads", "1"]
+    words += ["--max-matching-size", "100000", str(base)]
+    with served(home / "bin" / "osrm-routed", *words, port=port, where="OSRM"):
+        yield f"http://127.0.0.1:{port}"
 
 
 def osrm_segments(
@@ -344,30 +359,3 @@ def _write_network(network: OsrmNetwork, path: Path) -> None:
             oneway = {1: "yes", -1: "-1", 0: "no"}[int(network.direction[network.edge[head]])]
             tags = {"highway": "primary", "oneway": oneway}
             writer.add_way(osmium.osm.mutable.Way(id=head + 1, version=1, nodes=refs, tags=tags))
-
-
-def _run(home: Path, tool: str, *words: str) -> None:
-    """Run one of the programs of OSRM until it ends."""
-    done = subprocess.run([str(home / "bin" / tool), *words], capture_output=True, text=True, check=False)
-    if done.returncode:
-        lines = (done.stdout + done.stderr).strip().splitlines() or ["no message"]
-        raise Probe2RoadError(f"{tool} failed ({lines[-1]})", where="OSRM", fix="check that the graph has edges")
-
-
-def _free_port() -> int:
-    """Return a free port on this machine."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _wait_for(server: subprocess.Popen[bytes], port: int, log: Path) -> None:
-    """Wait until a server accepts connections."""
-    deadline = time.monotonic() + _START
-    while time.monotonic() < deadline and server.poll() is None:
-        with socket.socket() as probe:
-            if probe.connect_ex(("127.0.0.1", port)) == 0:
-                return
-        time.sleep(0.05)
-    lines = log.read_text(errors="replace").strip().splitlines() or ["no message"]
-    raise Probe2RoadError(f"osrm-routed did not start ({lines[-1]})", where="OSRM")

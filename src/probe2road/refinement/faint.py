@@ -103,9 +103,8 @@ def drop_faint(graph: RoadGraph, fleet: Fleet, matches: Matches, *, options: Fai
     parent = parts.edges[_PARENT].to_numpy()
     middle = shapely.line_interpolate_point(parts.edges.geometry.to_numpy(), 0.5, normalized=True)
     at = shapely.line_locate_point(graph.edges.geometry.to_numpy()[parent], middle)
-    nearest = stations.first[parent] + np.rint(at / stations.spacing[parent]).astype(np.int64)
     parts = replace(parts, edges=parts.edges.drop(columns=_PARENT))
-    return drop_edges(parts, faint[nearest], why="that few traces drove on, as roads here go")
+    return drop_edges(parts, faint[stations.nearest(parent, at)], why="that few traces drove on, as roads here go")
 
 
 def _traces_at(driven: Traversals, stations: Stations) -> NDArray[np.int64]:

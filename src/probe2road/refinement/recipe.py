@@ -137,10 +137,15 @@ def _split_junctions(at: _Stand) -> RoadGraph:
     return at.graph if same else split
 
 
+def _cleaned(at: _Stand, left: RoadGraph) -> RoadGraph:
+    """Clean what a step has left of the graph, unless that is all of it."""
+    return left if left is at.graph else clean_graph(left, options=at.clean)
+
+
 def _drop_undriven(at: _Stand) -> RoadGraph:
     least = at.options.min_support or 0
-    driven = drop_undriven(at.graph, at.matches.steps, min_traces=least, rungs=at.options.rungs if least else None)
-    return driven if driven is at.graph else clean_graph(driven, options=at.clean)
+    rungs = at.options.rungs if least else None
+    return _cleaned(at, drop_undriven(at.graph, at.matches.steps, min_traces=least, rungs=rungs))
 
 
 def _open_braids(at: _Stand) -> RoadGraph:
@@ -148,8 +153,7 @@ def _open_braids(at: _Stand) -> RoadGraph:
 
 
 def _drop_strays(at: _Stand) -> RoadGraph:
-    kept = drop_strays(at.graph, at.fleet, at.matches, options=at.options.strays)
-    return kept if kept is at.graph else clean_graph(kept, options=at.clean)
+    return _cleaned(at, drop_strays(at.graph, at.fleet, at.matches, options=at.options.strays))
 
 
 def _move_forks(at: _Stand) -> RoadGraph:
@@ -159,8 +163,7 @@ def _move_forks(at: _Stand) -> RoadGraph:
 def _drop_faint(at: _Stand) -> RoadGraph:
     if not at.options.min_support or at.fleet.points.empty:
         return at.graph
-    clear = drop_faint(at.graph, at.fleet, at.matches, options=at.options.faint)
-    return clear if clear is at.graph else clean_graph(clear, options=at.clean)
+    return _cleaned(at, drop_faint(at.graph, at.fleet, at.matches, options=at.options.faint))
 
 
 def _add_evidence(at: _Stand) -> RoadGraph:
