@@ -5,6 +5,7 @@ from . import baselines as baselines
 from . import benchmark as benchmark
 from . import bounds as bounds
 from . import cli as cli
+from . import comparison as comparison
 from . import crs as crs
 from . import demo as demo
 from . import draw as draw
@@ -29,6 +30,9 @@ from .alignment.align import add_drives as add_drives
 from .alignment.align import align as align
 from .alignment.options import AlignOptions as AlignOptions
 from .alignment.report import AlignmentReport as AlignmentReport
+from .comparison.identity import IdentityOptions as IdentityOptions
+from .comparison.identity import keep_ids as keep_ids
+from .comparison.overlap import OverlapOptions as OverlapOptions
 from .draw.view import view as view
 from .errors import Probe2RoadError as Probe2RoadError
 from .fleet.contract import Fleet as Fleet

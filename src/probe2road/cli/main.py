@@ -90,6 +90,15 @@ def build(
     min_vehicles: Annotated[int, typer.Option(help="Vehicles that an edge needs to be written.")] = 1,
     min_drives: Annotated[int, typer.Option(help="Drives that an edge needs to be written.")] = 1,
     first_id: Annotated[int, typer.Option(help="First id in OSM files for routing engines (.osm.pbf).")] = 1,
+    ids_from: Annotated[
+        Path | None, typer.Option(help="Earlier graph, whose ids are kept where the road is the same.")
+    ] = None,
+    first_new_id: Annotated[
+        int | None, typer.Option(help="With --ids-from: new ids are at least this; above all earlier ones without it.")
+    ] = None,
+    id_changes: Annotated[
+        Path | None, typer.Option(help="With --ids-from: table of what was kept, split, merged, moved, new and gone.")
+    ] = None,
     config: Annotated[Path | None, typer.Option(help="TOML file with build options, and how to read.")] = None,
     keep_intermediate: Annotated[
         Path | None, typer.Option(help="Folder that keeps what every stage made, and a picture of it.")
@@ -99,17 +108,23 @@ def build(
 
     An interrupted run goes on where it stopped when it is started again.
     """
+    from probe2road.comparison.identity import keep_ids
     from probe2road.draw.stages import draw_stages
     from probe2road.graph.disclosure import withhold
     from probe2road.io.fleet_reader import read_fleet
-    from probe2road.io.graph_files import graph_format, write_graph
+    from probe2road.io.graph_files import graph_format, read_graph, write_graph
     from probe2road.io.osm_writer import OsmOptions
+    from probe2road.io.table_writer import require_table_suffix, write_table
     from probe2road.options import options_from_table, read_toml
     from probe2road.recipe import BuildOptions
     from probe2road.recipe import build as build_graph
     from probe2road.run.workspace import resumable
 
-    _require_places(*output)
+    _require_places(*output, id_changes)
+    if id_changes is not None:
+        require_table_suffix(id_changes)
+    if ids_from is None and (id_changes is not None or first_new_id is not None):
+        raise OptionError("there are no earlier ids", where="build", fix="name the earlier graph with --ids-from")
     for path in output:
         graph_format(path)
     _require_folders(keep_intermediate)
@@ -122,11 +137,16 @@ def build(
     given = {name: value for name, value in chosen.items() if value is not None}
     options = replace(options, segmentation=replace(options.segmentation, **given), refine=options.refine and refine)
 
+    earlier = read_graph(ids_from) if ids_from else None
     fleet = read_fleet(traces, points, format=format)
     keeping = nullcontext(keep_intermediate) if keep_intermediate else resumable(output[0])
     with keeping as workspace, progress_bar() as progress:
         graph = build_graph(fleet, options=options, workspace=workspace, progress=progress)
         graph = withhold(graph, min_vehicles=min_vehicles, min_drives=min_drives)
+        if earlier is not None:
+            graph, changes = keep_ids(graph, earlier, first_new=first_new_id)
+            if id_changes is not None:
+                write_table(changes, id_changes, layer="changes")
         for path in output:
             write_graph(graph, path, osm=osm)
     if keep_intermediate:
