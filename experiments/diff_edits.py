@@ -4,7 +4,7 @@ The true road graph of a simulated city is edited: roads are removed, added, shi
 and bridges are joined to the roads below. `probe2road.diff` compares the result with a graph built from the drives.
 Every row that it lists is judged, every edit is looked for, and both are counted by class. Run it as
 
-    python experiments/diff_edits.py GRAPH REFERENCE --output FOLDER [--edits 500] [--seed 1] [--fit]
+    python experiments/diff_edits.py GRAPH REFERENCE --output FOLDER [--edits 500] [--seed 1] [--fit MAPS]
 
 GRAPH is what `probe2road build` made of a data set of the benchmark, REFERENCE its `reference.gpkg`. ``--fit`` prints
 the coefficients of `probe2road.comparison.probability` that fit these edits best.
@@ -196,13 +196,18 @@ def _add_roads(
         far = [stop for stop in near[start] if np.hypot(*(xy[stop] - xy[start])) > 100 and stop not in used]
         if len(rows) == quota or start in used or not far:
             continue
-        stop = int(rng.choice(far))
-        middle = (xy[start] + xy[stop]) / 2 + rng.normal(scale=0.1 * np.hypot(*(xy[stop] - xy[start])), size=2)
-        line = shapely.LineString([xy[start], middle, xy[stop]])
-        beside = shapely.union_all(truth.edges.geometry.to_numpy()[tree.query(line.buffer(25.0))]).buffer(25.0)
-        if line.intersection(beside).length > 0.4 * line.length:
+        line = None
+        for stop in rng.permutation(far)[:15]:
+            middle = (xy[start] + xy[stop]) / 2 + rng.normal(scale=0.1 * np.hypot(*(xy[stop] - xy[start])), size=2)
+            tried = shapely.LineString([xy[start], middle, xy[stop]])
+            spots = shapely.line_interpolate_point(tried, np.arange(0, tried.length, 10.0))
+            beside = np.unique(tree.query(spots, predicate="dwithin", distance=25.0)[0])
+            if 10.0 * len(beside) <= 0.2 * tried.length + 50.0:
+                line = tried
+                break
+        if line is None:
             continue
-        used |= {int(start), stop}
+        used |= {int(start), int(stop)}
         at_ends = truth.edges[
             truth.edges["u"].isin([ids[start], ids[stop]]) | truth.edges["v"].isin([ids[start], ids[stop]])
         ]
@@ -248,8 +253,9 @@ def judge(found: gpd.GeoDataFrame, edits: gpd.GeoDataFrame) -> NDArray[np.bool_]
                 true[row] = base_edge.iloc[row] in set(of["reverse"]["edge"])
             case "connection_added":  # a road that was removed is not connected either
                 true[row] = _is_near(xy[row], of["disconnect"]) or found.geometry.iloc[row].intersects(removed)
-            case _:
-                true[row] = _is_near(xy[row], of["join"])
+            case _:  # a road that does not exist is not connected either
+                ends = {base_edge.iloc[row], found["other_base_edge"].iloc[row]}
+                true[row] = _is_near(xy[row], of["join"]) or bool(ends & set(of["add"]["edge"]))
     return true
 
 
@@ -275,11 +281,22 @@ def find(edits: gpd.GeoDataFrame, found: gpd.GeoDataFrame) -> NDArray[np.bool_]:
     return hit
 
 
+def in_graph(edits: gpd.GeoDataFrame, graph: RoadGraph) -> NDArray[np.bool_]:
+    """Tell of which edits the graph has the road: what it does not have cannot be told from it."""
+    lines = graph.edges.geometry.to_numpy()
+    tree = shapely.STRtree(lines)
+    seen = np.zeros(len(edits), bool)
+    for row, (kind, line) in enumerate(zip(edits["kind"], edits.geometry, strict=True)):
+        own = shapely.union_all(lines[tree.query(line.buffer(8.0))]).buffer(8.0)
+        seen[row] = kind in ("add", "join") or line.intersection(own).length > 0.8 * line.length
+    return seen
+
+
 def report(
     found: gpd.GeoDataFrame, true: NDArray[np.bool_], edits: gpd.GeoDataFrame, hit: NDArray[np.bool_]
 ) -> pd.DataFrame:
     """Return precision and recall by kind of edit."""
-    rows = []
+    rows, there = [], edits["in_graph"].to_numpy(bool)
     for kind, changes in FOUND_AS.items():
         listed = found["change"].isin(changes).to_numpy()
         own = (edits["kind"] == kind).to_numpy()
@@ -294,6 +311,8 @@ def report(
                 "recall of all": hit[own].mean() if own.any() else np.nan,
                 "driven": int(seen.sum()),
                 "recall of driven": hit[seen].mean() if seen.any() else np.nan,
+                "in the graph": int((seen & there).sum()),
+                "recall in the graph": hit[seen & there].mean() if (seen & there).any() else np.nan,
             }
         )
     return pd.DataFrame(rows)
@@ -338,14 +357,22 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--edits", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--fit", action="store_true")
+    parser.add_argument("--fit", type=int, default=0, help="so many edited maps, from the seed on")
     given = parser.parse_args()
     given.output.mkdir(parents=True, exist_ok=True)
     graph = read_graph(given.graph)
-    edits = edit_map(read_graph(given.reference).to_crs(graph.crs), given.edits, seed=given.seed)
+    reference = read_graph(given.reference).to_crs(graph.crs)
+    edits = edit_map(reference, given.edits, seed=given.seed)
+    edits.table["in_graph"] = in_graph(edits.table, graph)
     if given.fit:
-        every = diff(graph, edits.base, options=DiffOptions(min_probability=0.0, min_expected=0.5))
-        fit(every, judge(every, edits.table))
+        tables, truths = [], []
+        for seed in range(given.seed, given.seed + given.fit):
+            more = edit_map(reference, given.edits, seed=seed)
+            every = diff(graph, more.base, options=DiffOptions(min_probability=1e-9, min_expected=0.5))
+            tables.append(every)
+            truths.append(judge(every, more.table))
+        fit(pd.concat(tables, ignore_index=True), np.concatenate(truths))
+        return
     found = diff(graph, edits.base)
     true, hit = judge(found, edits.table), find(edits.table, found)
     table = report(found, true, edits.table, hit)

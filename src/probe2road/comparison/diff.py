@@ -67,6 +67,7 @@ _COLUMNS = {
     "osmid": "str",
     "length": "float64",
     "distance": "float64",
+    "nearest": "float64",
     "support": "float64",
     "along": "float64",
     "against": "float64",
@@ -116,10 +117,10 @@ def diff(graph: RoadGraph, base: RoadGraph, *, options: DiffOptions | None = Non
         ``change``, ``probability`` (that it is so); ``edge`` with ``at_begin`` and ``at_end`` (0 to 1 along our edge),
         ``base_edge`` with ``base_begin`` and ``base_end`` (the same on the base); ``other_edge``, ``other_base_edge``
         (the second road of a connection); ``osmid`` (of the way, if the base names it); ``length`` (m), ``distance``
-        (m between the two, median), ``support`` (traces), ``along`` and ``against`` (traversals in the direction of the
+        (m between the two, median), ``nearest`` (share of the base road that our line is nearest to), ``support`` (traces), ``along`` and ``against`` (traversals in the direction of the
         base road, or of ours if it is added), ``oneway`` (what it should say), ``count`` (drives over a connection),
-        ``expected`` (drives that should have passed), ``crosses`` and ``clearance`` (whether our two roads cross without
-        meeting, and the m between them), ``dead_end_distance`` (m from a connection to a road that ends on the map that
+        ``expected`` (drives that should have passed), ``crosses`` and ``clearance`` (whether the two roads cross without
+        meeting on the map that does not join them, and the m between them), ``dead_end_distance`` (m from a connection to a road that ends on the map that
         lacks it), ``odds`` (probability of a direction before calibration); lines in plan.
         Values that do not belong to a change are missing.
 
@@ -148,7 +149,7 @@ def diff(graph: RoadGraph, base: RoadGraph, *, options: DiffOptions | None = Non
     ours, theirs = (roads_of(_directed(one)) for one in (graph, base))
     require_counts(ours, where="diff")
     found, back = mutual(ours, theirs, options.overlap)
-    flows = base_flows(ours, theirs, found)
+    flows = base_flows(ours, theirs, found, back)
     on_base = pieces(back, theirs.network.length, shortest=options.shortest)
     on_ours = pieces(found, ours.network.length, shortest=options.shortest)
     tables = [
@@ -174,7 +175,8 @@ def _directed(graph: RoadGraph) -> RoadGraph:
 def _positions(on_base: pd.DataFrame, ours: Roads, theirs: Roads, flows: pd.DataFrame) -> pd.DataFrame:
     """Return the pieces of the base that drives confirm, or that lie elsewhere."""
     table = on_base[on_base["matched"] & (on_base["other"] >= 0)].reset_index(drop=True)
-    table["support"] = flows["support"].to_numpy()[table["edge"]]
+    table["length"] = table["end"] - table["begin"]
+    table["nearest"] = flows["nearest"].to_numpy()[table["edge"]]
     probability = probabilities("moved", table)
     moved = probability >= 0.5
     line = np.where(
@@ -188,8 +190,7 @@ def _positions(on_base: pd.DataFrame, ours: Roads, theirs: Roads, flows: pd.Data
             "probability": np.where(moved, probability, 1.0 - probability),
             **_place(ours, table["other"], table["other_begin"], table["other_end"]),
             **_place(theirs, table["edge"], table["begin"], table["end"], base=True),
-            "length": table["end"] - table["begin"],
-            "distance": table["distance"],
+            **{name: table[name] for name in ("length", "distance", "nearest")},
             **{name: flows[name].to_numpy()[table["edge"]] for name in ("support", "along", "against")},
             "geometry": line,
         }
@@ -269,6 +270,7 @@ def _connections_added(ours: Roads, theirs: Roads, found: Mutual, options: DiffO
     # Against the direction of a road went nobody, but a drive that was on the road beside it.
     closed = table["closed"] | table["closed_to"]
     table = table[~table["connected"] & ~closed & (table["count"] > 0)].reset_index(drop=True)
+    table = with_crossings(table, theirs, rows=("other", "other_to"), radius=options.same_place)
     table = one_a_place(table, weight="count", radius=options.same_place)
     table["dead_end_distance"] = dead_end_distance(table[["x", "y"]].to_numpy(), theirs.network)
     table["probability"] = probabilities("connection_added", table)

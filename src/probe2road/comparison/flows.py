@@ -28,33 +28,39 @@ def require_counts(roads: Roads, *, where: str) -> None:
         )
 
 
-def base_flows(ours: Roads, theirs: Roads, found: Mutual) -> pd.DataFrame:
+def base_flows(ours: Roads, theirs: Roads, found: Mutual, back: Mutual) -> pd.DataFrame:
     """Return the traversals of every edge of a base map, as our counts give them.
 
     The counts of our edges are brought to the base road on which each place of theirs lies, in each direction for
-    itself: one line of ours may stand for two carriageways, and two lines of ours for one street of the base.
+    itself: one line of ours may stand for two carriageways, and two lines of ours for one street of the base. A one-way
+    road of the base gets counts only from lines that are its nearest: others belong to a carriageway that is not there.
 
     Parameters
     ----------
     ours, theirs
         The graph with counts, and the base map.
-    found
-        Our places, looked up on the base.
+    found, back
+        Our places, looked up on the base, and those of the base.
 
     Returns
     -------
     DataFrame, indexed by the rows of the base's edges
-        ``along`` and ``against``, traversals; ``support``, distinct traces, and ``covered``, the share of the edge that
-        they were seen on.
+        ``along`` and ``against``, traversals; ``support``, distinct traces; ``covered``, the share of the edge that
+        they were seen on; ``nearest``, the share to which one of our lines is nearer than to any other road of the base.
     """
     edges = ours.graph.edges
     counts = [edges[name].to_numpy(np.float64, na_value=0.0) for name in ("forward", "backward", "support")]
     n = len(theirs.sense)
     total: dict[str, NDArray[np.float64]] = {name: np.zeros(n) for name in ("along", "against", "support")}
     metres: dict[str, NDArray[np.float64]] = {name: np.zeros(n) for name in ("along", "against", "any")}
+    nearest = set(zip(back.best[0].tolist(), back.found[0].edge.tolist(), strict=True))  # pairs of our edge and theirs
     for way, count in ((0, counts[0]), (1, counts[1])):
         places, has = found.found[way], found.has[way]
         driven = has & (count[places.edge] > 0)
+        own = np.fromiter(
+            (pair in nearest for pair in zip(places.edge.tolist(), places.other.tolist(), strict=True)), bool
+        )
+        driven &= own | (theirs.sense[np.maximum(places.other, 0)] == 0)
         for name, goes in (("along", places.along != (way == 1)), ("against", places.along == (way == 1))):
             rows = np.flatnonzero(driven & goes)
             to, size = places.other[rows], places.metres[rows]
@@ -73,6 +79,7 @@ def base_flows(ours: Roads, theirs: Roads, found: Mutual) -> pd.DataFrame:
             "along": total["along"] / seen,
             "against": total["against"] / seen,
             "support": total["support"] / np.clip(metres["any"], 1e-9, length),
+            "nearest": np.clip(metres["any"] / length, 0.0, 1.0),
             "covered": np.clip(np.maximum(metres["along"], metres["against"]) / length, 0.0, 1.0),
         }
     )

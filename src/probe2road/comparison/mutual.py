@@ -3,19 +3,25 @@
 Strategy. Every place of a road is looked up on the other map in each direction in which it is driven. It has a
 counterpart only if that is mutual: if places of the other road, looked up in turn, come back to within some metres.
 Otherwise the second carriageway of a street whose first one alone is mapped, or a track beside a motorway, would be
-taken for the nearest road within the radius. Runs of places with and without a counterpart are the pieces of a road;
+taken for the nearest road within the radius. What is left of both maps is looked up on each other once more, whichever
+way it is driven: a carriageway that lies nearer to the other one than to itself, or is drawn the wrong way. Runs of places with and without a counterpart are the pieces of a road;
 runs that are too short to say anything are joined to their neighbours.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from shapely.ops import substring
 
 from probe2road.comparison.overlap import Counterparts, OverlapOptions, Roads, counterparts
+from probe2road.graph.roadgraph import graph_from_lines
+from probe2road.metrics.network import Network, locate, network_from_graph
+from probe2road.metrics.projection import direction_over, project_along
 
 __all__ = ["Mutual", "mutual", "pieces"]
 
@@ -74,21 +80,82 @@ def mutual(ours: Roads, theirs: Roads, options: OverlapOptions) -> tuple[Mutual,
     >>> [bool(found.matched[found.found[0].edge == edge].all()) for edge in (0, 1)]
     [True, False]
     """
-    looked = [
-        tuple(counterparts(one, other, options, way=way) for way in (1, -1))
-        for one, other in ((ours, theirs), (theirs, ours))
-    ]
-    driven = [_driven_ways(roads) for roads in (ours, theirs)]
-    used = [
-        tuple(ways[way][found[way].edge] & (found[way].other >= 0) for way in (0, 1))
-        for ways, found in zip(driven, looked, strict=True)
-    ]
-    return tuple(
-        Mutual(
-            looked[i], tuple(used[i][way] & _comes_back(looked[i][way], looked[1 - i], used[1 - i]) for way in (0, 1))
-        )
-        for i in (0, 1)
-    )  # type: ignore[return-value]
+    maps = (ours, theirs)
+    looked = [[counterparts(maps[i], maps[1 - i], options, way=way) for way in (1, -1)] for i in (0, 1)]
+    ways = [_driven_ways(roads) for roads in maps]
+    has = _both_ways(looked, ways)
+    unmatched = [~(ahead | back) for ahead, back in has]
+    rests = [_rest(maps[i], looked[i][0], unmatched[i]) for i in (0, 1)]
+    again = [_looked_up_again(maps[i], looked[i][0], unmatched[i], rests[1 - i], options) for i in (0, 1)]
+    has_again = _both_ways([[one, one] for one in again], ways)
+    results = []
+    for i in (0, 1):
+        found = tuple(_filled(first, again[i], unmatched[i]) for first in looked[i])
+        late = tuple(before | (now & unmatched[i]) for before, now in zip(has[i], has_again[i], strict=True))
+        results.append(Mutual((found[0], found[1]), (late[0], late[1])))
+    return results[0], results[1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Rest:
+    """The stretches of a map that have no counterpart yet: their lines, and where they are."""
+
+    network: Network
+    edge: NDArray[np.int64]  # row of the edge that a stretch is of
+    begin: NDArray[np.float64]  # m along it
+
+
+def _both_ways(
+    looked: Sequence[Sequence[Counterparts]], ways: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]]
+) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+    """Tell of each map which places have a mutual counterpart, along the lines and against them."""
+    used = [[ways[i][way][looked[i][way].edge] & (looked[i][way].other >= 0) for way in (0, 1)] for i in (0, 1)]
+    has = [[used[i][way] & _comes_back(looked[i][way], looked[1 - i], used[1 - i]) for way in (0, 1)] for i in (0, 1)]
+    return [(ahead, back) for ahead, back in has]
+
+
+def _rest(roads: Roads, places: Counterparts, unmatched: NDArray[np.bool_]) -> _Rest:
+    """Cut the stretches without a counterpart out of a map."""
+    run = _runs(places.edge, unmatched)
+    first = _firsts(run)
+    last = np.append(first[1:], len(run)) - 1
+    first, last = first[unmatched[first]], last[unmatched[first]]
+    begin = places.offset[first] - places.metres[first] / 2
+    end = places.offset[last] + places.metres[last] / 2
+    edge = places.edge[first]
+    kept = end - begin > 1.0
+    edge, begin, end = edge[kept], begin[kept], end[kept]
+    lines = [substring(roads.network.lines[row], low, high) for row, low, high in zip(edge, begin, end, strict=True)]
+    return _Rest(network_from_graph(graph_from_lines(lines, crs=roads.graph.crs)), edge, begin)
+
+
+def _looked_up_again(
+    roads: Roads, places: Counterparts, unmatched: NDArray[np.bool_], rest: _Rest, options: OverlapOptions
+) -> Counterparts:
+    """Look up the places without a counterpart on what is left of the other map, whichever way it is driven."""
+    rows = np.flatnonzero(unmatched)
+    edge, offset = places.edge[rows], places.offset[rows]
+    xy, _ = locate(roads.network, edge, offset)
+    direction = direction_over(roads.network, edge, offset, options.span)
+    stretch, at = project_along(
+        xy, direction, rest.network, radius=options.radius, max_angle=options.max_angle, span=options.span
+    )
+    on = stretch >= 0
+    n = len(places.edge)
+    other, other_offset = np.full(n, -1, np.int64), np.zeros(n)
+    distance, along = np.full(n, np.nan), np.zeros(n, bool)
+    there, _ = locate(rest.network, stretch[on], at[on])
+    other[rows[on]] = rest.edge[stretch[on]]
+    other_offset[rows[on]] = rest.begin[stretch[on]] + at[on]
+    distance[rows[on]] = np.hypot(*(there - xy[on]).T)
+    along[rows[on]] = (direction_over(rest.network, stretch[on], at[on], options.span) * direction[on]).sum(axis=1) > 0
+    return replace(places, other=other, other_offset=other_offset, distance=distance, along=along)
+
+
+def _filled(first: Counterparts, again: Counterparts, unmatched: NDArray[np.bool_]) -> Counterparts:
+    """Return the second lookup in the place of the first one where that was not mutual."""
+    names = ("other", "other_offset", "distance", "along")
+    return replace(first, **{name: np.where(unmatched, getattr(again, name), getattr(first, name)) for name in names})
 
 
 def _driven_ways(roads: Roads) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -106,7 +173,7 @@ def _driven_ways(roads: Roads) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
 
 
 def _comes_back(
-    places: Counterparts, back: tuple[Counterparts, ...], used: tuple[NDArray[np.bool_], ...]
+    places: Counterparts, back: Sequence[Counterparts], used: Sequence[NDArray[np.bool_]]
 ) -> NDArray[np.bool_]:
     """Tell of each place whether a lookup from its counterpart leads to it."""
     hit = np.concatenate([one.other[on] for one, on in zip(back, used, strict=True)])

@@ -16,21 +16,21 @@ from scipy.special import expit
 __all__ = ["FEATURES", "evidence_features", "probabilities"]
 
 FEATURES: Mapping[str, tuple[str, ...]] = {
-    "moved": ("distance", "shared"),
+    "moved": ("distance", "shared", "log_length"),
     "added": ("log_support", "log_length"),
     "suspect_closed": ("log_expected",),
     "direction_changed": ("log_odds",),
-    "connection_added": ("log_count", "dead_end"),
-    "connection_missing": ("log_expected", "crosses", "dead_end"),
+    "connection_added": ("log_count", "loose"),
+    "connection_missing": ("log_expected", "crosses"),
 }  # what each model weighs
 
 _COEFFICIENTS: Mapping[str, tuple[float, ...]] = {
-    "moved": (-10.0, 2.0, -8.0),
-    "added": (0.0, 1.0, 0.0),
-    "suspect_closed": (-3.0, 1.0),
-    "direction_changed": (0.0, 1.0),
-    "connection_added": (0.0, 0.5, 1.0),
-    "connection_missing": (0.0, 0.5, 1.0, -1.0),
+    "moved": (-9.89, 0.45, 0.44, 1.01),
+    "added": (1.63, 0.39, -0.06),
+    "suspect_closed": (-3.44, 1.21),
+    "direction_changed": (-2.02, 0.45),
+    "connection_added": (-1.34, 0.38, 2.44),
+    "connection_missing": (0.1, -0.24, 3.11),
 }  # the constant, and one for each feature
 
 _NEAR = 60.0  # m within which the dead end of a road may be the reason why two roads are not joined
@@ -43,19 +43,19 @@ def evidence_features(evidence: pd.DataFrame) -> pd.DataFrame:
     Parameters
     ----------
     evidence
-        Any of ``distance`` (m), ``support``, ``length`` (m), ``expected``, ``count``, ``crosses``, ``odds``
+        Any of ``distance`` (m), ``nearest``, ``support``, ``length`` (m), ``expected``, ``count``, ``crosses``, ``odds``
         (a probability) and ``dead_end_distance`` (m).
 
     Examples
     --------
     >>> evidence_features(pd.DataFrame({"support": [0.0], "dead_end_distance": [12.0]})).values.tolist()
-    [[1.0, 0.0, 1.0]]
+    [[0.0, 1.0]]
     """
     made: dict[str, NDArray[np.float64]] = {}
     if "distance" in evidence:
         made["distance"] = evidence["distance"].to_numpy(np.float64)
-    if "support" in evidence:  # another road of the base is nearer to our line, which stands for both
-        made["shared"] = (evidence["support"].to_numpy(np.float64) < 0.5).astype(np.float64)
+    if "nearest" in evidence:  # our line stands for a nearer road of the base as well
+        made["shared"] = 1.0 - evidence["nearest"].to_numpy(np.float64)
     for name in ("support", "length", "expected", "count"):
         if name in evidence:
             made[f"log_{name}"] = np.log1p(evidence[name].to_numpy(np.float64))
@@ -63,9 +63,11 @@ def evidence_features(evidence: pd.DataFrame) -> pd.DataFrame:
         odds = np.clip(evidence["odds"].to_numpy(np.float64), 1e-12, 1 - 1e-12)
         made["log_odds"] = np.clip(np.log(odds / (1 - odds)), -_MOST_ODDS, _MOST_ODDS)
     if "crosses" in evidence:
-        made["crosses"] = evidence["crosses"].to_numpy(np.float64)
-    if "dead_end_distance" in evidence:
-        made["dead_end"] = (evidence["dead_end_distance"].to_numpy(np.float64) <= _NEAR).astype(np.float64)
+        made["crosses"] = evidence["crosses"].to_numpy(np.float64, na_value=0.0)
+    if "dead_end_distance" in evidence:  # the roads of the map end there, or cross, but do not meet
+        loose = evidence["dead_end_distance"].to_numpy(np.float64) <= _NEAR
+        crosses = evidence["crosses"].to_numpy(bool, na_value=False) if "crosses" in evidence else False
+        made["loose"] = (loose | crosses).astype(np.float64)
     return pd.DataFrame(made, index=evidence.index)
 
 
