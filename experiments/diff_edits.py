@@ -16,6 +16,7 @@ import argparse
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import geopandas as gpd
 import numpy as np
@@ -32,7 +33,7 @@ from probe2road.graph.roadgraph import RoadGraph
 from probe2road.graph.tables import empty_turns, finish_edges
 from probe2road.io.graph_files import read_graph
 from probe2road.metrics.junctions import crossings_without_node
-from probe2road.metrics.network import network_from_graph
+from probe2road.metrics.network import Network, network_from_graph
 
 KINDS = ("remove", "add", "shift", "reverse", "disconnect", "join")
 SHORTEST = {"remove": 60.0, "shift": 150.0, "reverse": 60.0, "disconnect": 80.0}  # m of an edge that is edited so
@@ -53,7 +54,7 @@ CALIBRATED = ("moved", "added", "suspect_closed", "direction_changed", "connecti
 
 @dataclass(frozen=True)
 class Edits:
-    """An edited map, and what was done: ``kind``, ``edge`` (id; NA for a join), ``x``, ``y``, ``support``, ``geometry``."""
+    """An edited map, and what was done: ``kind``, ``edge`` (id; NA for a join), ``x``, ``y``, ``support``, the line."""
 
     base: RoadGraph
     table: gpd.GeoDataFrame
@@ -86,7 +87,7 @@ def edit_map(truth: RoadGraph, n_edits: int, *, seed: int) -> Edits:
         rows.append(_edit(kind, int(edge), old, edges, nodes, rng))
         if kind == "remove":
             edges = edges.drop(index=edge)
-    edges, added = _add_roads(truth, edges, nodes, quota, rng)
+    edges, added = _add_roads(truth, edges, quota, rng)
     rows += added
     points = gpd.GeoDataFrame(
         geometry=list(nodes.values()), index=pd.Index(nodes.keys(), name="node", dtype="int64"), crs=truth.crs
@@ -113,22 +114,22 @@ def _edit(
     edges: gpd.GeoDataFrame,
     nodes: dict[int, shapely.Point],
     rng: np.random.Generator,
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Edit one edge in place, and return what was done."""
     line = old.geometry
     place = line.interpolate(0.5, normalized=True)
     if kind == "shift":
-        edges.at[edge, "geometry"] = _shifted(line, rng.choice([-1, 1]) * rng.uniform(6, 15))
+        edges.loc[edge, "geometry"] = _shifted(line, rng.choice([-1, 1]) * rng.uniform(6, 15))
     elif kind == "reverse":
         edges.loc[edge, ["u", "v"]] = [old["v"], old["u"]]
-        edges.at[edge, "geometry"] = line.reverse()
+        edges.loc[edge, "geometry"] = line.reverse()
     elif kind == "disconnect":
         place = shapely.Point(line.coords[0])
         cut = substring(line, rng.uniform(8, 15), line.length)
         new = max(nodes) + 1
         nodes[new] = shapely.Point(cut.coords[0])
-        edges.at[edge, "u"] = new
-        edges.at[edge, "geometry"] = cut
+        edges.loc[edge, "u"] = new
+        edges.loc[edge, "geometry"] = cut
     where = {"x": place.x, "y": place.y, "support": int(old["support"]), "node": int(old["u"])}
     return {"kind": kind, "edge": edge, **where, "geometry": shapely.force_2d(line)}
 
@@ -148,18 +149,24 @@ def _join_bridges(
     truth: RoadGraph,
     edges: gpd.GeoDataFrame,
     nodes: dict[int, shapely.Point],
-    network: object,
+    network: Network,
     quota: int,
     rng: np.random.Generator,
-) -> tuple[gpd.GeoDataFrame, list[dict[str, object]]]:
+) -> tuple[gpd.GeoDataFrame, list[dict[str, Any]]]:
     """Join pairs of roads where they cross on two levels: both are cut there, and share a new node."""
-    i, j, xy = crossings_without_node(network, 4.0)  # type: ignore[arg-type]
-    rows, used, parts = [], set[int](), []
+    i, j, xy = crossings_without_node(network, 4.0)
+    used = set[int]()
+    rows: list[dict[str, Any]] = []
+    parts: list[pd.Series] = []
     ids, lines = truth.edges.index.to_numpy(), truth.edges.geometry.to_numpy()
     for k in rng.permutation(len(i)):
         pair = [int(i[k]), int(j[k])]
         at = [lines[row].project(shapely.Point(xy[k])) for row in pair]
-        if len(rows) == quota or used & set(pair) or min(min(s, lines[r].length - s) for s, r in zip(at, pair)) < 20:
+        if (
+            len(rows) == quota
+            or used & set(pair)
+            or min(min(s, lines[r].length - s) for s, r in zip(at, pair, strict=True)) < 20
+        ):
             continue
         used |= set(pair)
         node, own = max(nodes) + 1, truth.edges.iloc[pair]
@@ -174,8 +181,10 @@ def _join_bridges(
                 part["geometry"] = shapely.LineString(coordinates)
                 parts.append(part)
         place = {"x": xy[k, 0], "y": xy[k, 1], "support": int(own["support"].min()), "node": node}
+        near = [substring(lines[row], s - 20.0, s + 20.0) for row, s in zip(pair, at, strict=True)]
+        crossing = shapely.force_2d(shapely.MultiLineString(near))
         around = {int(end) for end in own[["u", "v"]].to_numpy().ravel()}
-        rows.append({"kind": "join", "edge": pd.NA, **place, "geometry": shapely.Point(xy[k]), "nodes": around})
+        rows.append({"kind": "join", "edge": pd.NA, **place, "geometry": crossing, "nodes": around})
     kept = edges.drop(index=ids[sorted(used)])
     if parts:
         new = gpd.GeoDataFrame(parts, geometry="geometry", crs=edges.crs)
@@ -185,13 +194,15 @@ def _join_bridges(
 
 
 def _add_roads(
-    truth: RoadGraph, edges: gpd.GeoDataFrame, nodes: dict[int, shapely.Point], quota: int, rng: np.random.Generator
-) -> tuple[gpd.GeoDataFrame, list[dict[str, object]]]:
+    truth: RoadGraph, edges: gpd.GeoDataFrame, quota: int, rng: np.random.Generator
+) -> tuple[gpd.GeoDataFrame, list[dict[str, Any]]]:
     """Add two-way roads that do not exist, between nodes 100 to 600 m apart."""
     xy = shapely.get_coordinates(truth.nodes.geometry.to_numpy())
     ids, tree = truth.nodes.index.to_numpy(), shapely.STRtree(truth.edges.geometry.to_numpy())
     near = KDTree(xy).query_ball_point(xy, 600.0)
-    rows, parts, used, next_id = [], [], set[int](), int(edges.index.max()) + 1
+    used, next_id = set[int](), int(edges.index.max()) + 1
+    rows: list[dict[str, Any]] = []
+    parts: list[pd.Series] = []
     for start in rng.permutation(len(xy)):
         far = [stop for stop in near[start] if np.hypot(*(xy[stop] - xy[start])) > 100 and stop not in used]
         if len(rows) == quota or start in used or not far:
@@ -287,8 +298,8 @@ def in_graph(edits: gpd.GeoDataFrame, graph: RoadGraph) -> NDArray[np.bool_]:
     tree = shapely.STRtree(lines)
     seen = np.zeros(len(edits), bool)
     for row, (kind, line) in enumerate(zip(edits["kind"], edits.geometry, strict=True)):
-        own = shapely.union_all(lines[tree.query(line.buffer(8.0))]).buffer(8.0)
-        seen[row] = kind in ("add", "join") or line.intersection(own).length > 0.8 * line.length
+        own = shapely.union_all(lines[tree.query(line.buffer(4.0))]).buffer(4.0)
+        seen[row] = kind == "add" or line.intersection(own).length > 0.8 * line.length
     return seen
 
 
@@ -380,9 +391,8 @@ def main() -> None:
     print(table.round(3).to_string(index=False))
     print(bins.round(3).to_string(), f"\nreliability: {error:.3f}")
     for change, rows in found.groupby("change"):
-        print(
-            f"{change}: {len(rows)} rows, probability {rows['probability'].mean():.3f}, true {true[rows.index].mean():.3f}"
-        )
+        share = true[rows.index].mean()
+        print(f"{change}: {len(rows)} rows, probability {rows['probability'].mean():.3f}, true {share:.3f}")
     found.assign(true=true).to_file(given.output / "found.gpkg", layer="differences")
     edits.table.assign(found=hit).to_file(given.output / "edits.gpkg", layer="edits")
     table.to_csv(given.output / "classes.csv", index=False)

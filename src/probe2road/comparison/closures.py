@@ -60,13 +60,25 @@ def expected_passages(theirs: Roads, flows: pd.DataFrame, driven: NDArray[np.boo
     head = np.where(ahead, network.v[edge], network.u[edge])
     flow = np.where(ahead, flows["along"].to_numpy()[edge], flows["against"].to_numpy()[edge])
     flow = np.where(driven[edge], flow, 0.0)
+    back = _reversed_arcs(edge, n)
     sides = []
     for near, far in ((tail, head), (head, tail)):
         share = weight[edge] / np.bincount(near, weights=weight[edge], minlength=len(network.node_xy))[near]
         passing = flow.copy()
         for _ in range(_ROUNDS):
             arriving = np.bincount(far, weights=passing, minlength=len(network.node_xy))
-            passing = np.where(driven[edge], flow, arriving[near] * share)
+            turned = np.where(back >= 0, passing[back], 0.0)  # nobody drives into a road to turn and come back
+            passing = np.where(driven[edge], flow, (arriving[near] - turned) * share)
         sides.append(passing)
     expected = np.where(driven[edge], 0.0, np.minimum(*sides))
-    return np.bincount(edge, weights=expected, minlength=n)
+    return np.bincount(edge, weights=expected, minlength=n).astype(np.float64)
+
+
+def _reversed_arcs(edge: NDArray[np.int64], n_edges: int) -> NDArray[np.int64]:
+    """Return for every arc the row of the arc of its edge in the other direction, -1 if that is closed."""
+    row = np.arange(len(edge))
+    first, last = np.full(n_edges, -1, np.int64), np.full(n_edges, -1, np.int64)
+    last[edge] = row
+    first[edge[::-1]] = row[::-1]
+    other = np.where(first[edge] == row, last[edge], first[edge])
+    return np.where(other == row, -1, other)

@@ -175,8 +175,8 @@ def with_other_map(
     DataFrame
         The rows whose spots are on two roads of the other map, or apart on one, with ``edge``, ``at``, ``edge_to``,
         ``at_to`` (rows and metres on the own map), ``other``, ``other_at``, ``other_to``, ``other_at_to`` (on the
-        other), ``straight`` (cosine of the angle between the two directions), ``closed`` and ``closed_to`` (whether the other
-        map has the roads closed in the direction that is driven) and ``connected``.
+        other), ``straight`` (cosine of the angle between the two directions), ``closed`` and ``closed_to`` (whether
+        the other map has the roads closed in the direction that is driven) and ``connected``.
     """
     sought = {"radius": options.radius, "max_angle": options.max_angle, "span": options.span}
     table = ways.copy()

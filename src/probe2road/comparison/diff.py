@@ -113,16 +113,20 @@ def diff(graph: RoadGraph, base: RoadGraph, *, options: DiffOptions | None = Non
     Returns
     -------
     GeoDataFrame
-        One row for each piece of a road, direction or connection, in the order of `DIFFERENCES` and along the edges.
-        ``change``, ``probability`` (that it is so); ``edge`` with ``at_begin`` and ``at_end`` (0 to 1 along our edge),
-        ``base_edge`` with ``base_begin`` and ``base_end`` (the same on the base); ``other_edge``, ``other_base_edge``
-        (the second road of a connection); ``osmid`` (of the way, if the base names it); ``length`` (m), ``distance``
-        (m between the two, median), ``nearest`` (share of the base road that our line is nearest to), ``support`` (traces), ``along`` and ``against`` (traversals in the direction of the
-        base road, or of ours if it is added), ``oneway`` (what it should say), ``count`` (drives over a connection),
-        ``expected`` (drives that should have passed), ``crosses`` and ``clearance`` (whether the two roads cross without
-        meeting on the map that does not join them, and the m between them), ``dead_end_distance`` (m from a connection to a road that ends on the map that
-        lacks it), ``odds`` (probability of a direction before calibration); lines in plan.
-        Values that do not belong to a change are missing.
+        One row for each piece of a road, direction or connection, in the order of `DIFFERENCES` and along the edges,
+        with the line in plan; what does not belong to a change is missing:
+
+        * ``change``, and ``probability`` that it is so;
+        * ``edge``, and ``at_begin``, ``at_end``: the stretch of our edge, 0 to 1 along it. ``base_edge``,
+          ``base_begin``, ``base_end``: the same on the base; ``osmid``: its way, if the base names it. ``other_edge``,
+          ``other_base_edge``: the second road of a connection, on which the stretch ends;
+        * ``length`` (m); ``distance`` (m between the two roads, median); ``nearest`` (share of the base road that our
+          line is nearer to than to any other); ``support`` (traces); ``along``, ``against`` (traversals in the
+          direction of the base road, or of ours if it is added); ``oneway`` (what the map should say);
+        * ``count`` (drives over a connection); ``expected`` (drives that should have passed); ``crosses`` and
+          ``clearance`` (whether the two roads cross without meeting on the map that does not join them, and the m
+          between them); ``dead_end_distance`` (m from a connection to a dead end on that map); ``odds`` (probability of
+          a direction before calibration).
 
     Raises
     ------
@@ -208,7 +212,7 @@ def _added(on_ours: pd.DataFrame, ours: Roads, options: DiffOptions) -> pd.DataF
     }
     table = table.assign(**counts)
     table["probability"] = probabilities("added", table)
-    table["oneway"] = np.where(ours.sense[table["edge"]] == 1, "yes", None)
+    table["oneway"] = pd.Series("yes", table.index).where(ours.sense[table["edge"]] == 1)
     table = table[table["probability"] >= options.min_probability].reset_index(drop=True)
     return pd.DataFrame(
         {

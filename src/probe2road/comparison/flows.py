@@ -46,7 +46,7 @@ def base_flows(ours: Roads, theirs: Roads, found: Mutual, back: Mutual) -> pd.Da
     -------
     DataFrame, indexed by the rows of the base's edges
         ``along`` and ``against``, traversals; ``support``, distinct traces; ``covered``, the share of the edge that
-        they were seen on; ``nearest``, the share to which one of our lines is nearer than to any other road of the base.
+        they were seen on; ``nearest``, the share to which one of our lines is nearer than to any other of its roads.
     """
     edges = ours.graph.edges
     counts = [edges[name].to_numpy(np.float64, na_value=0.0) for name in ("forward", "backward", "support")]

@@ -4,8 +4,9 @@ Strategy. Every place of a road is looked up on the other map in each direction 
 counterpart only if that is mutual: if places of the other road, looked up in turn, come back to within some metres.
 Otherwise the second carriageway of a street whose first one alone is mapped, or a track beside a motorway, would be
 taken for the nearest road within the radius. What is left of both maps is looked up on each other once more, whichever
-way it is driven: a carriageway that lies nearer to the other one than to itself, or is drawn the wrong way. Runs of places with and without a counterpart are the pieces of a road;
-runs that are too short to say anything are joined to their neighbours.
+way it is driven: a carriageway that lies nearer to the other one than to itself, or is drawn the wrong way. Runs of
+places with and without a counterpart are the pieces of a road; runs that are too short to say anything are joined to
+their neighbours.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from probe2road.metrics.projection import direction_over, project_along
 __all__ = ["Mutual", "mutual", "pieces"]
 
 _BACK = 12.0  # m along a road, within which a place that is looked up from the other map must come back
+_AGAIN = 15.0  # m to what is left of the other map, at most
 _SOME = 0.1  # share of the traversals in one direction, from which on a road is looked up in it
 
 
@@ -83,17 +85,23 @@ def mutual(ours: Roads, theirs: Roads, options: OverlapOptions) -> tuple[Mutual,
     maps = (ours, theirs)
     looked = [[counterparts(maps[i], maps[1 - i], options, way=way) for way in (1, -1)] for i in (0, 1)]
     ways = [_driven_ways(roads) for roads in maps]
-    has = _both_ways(looked, ways)
+    has = _both_ways(looked, ways, maps, options)
     unmatched = [~(ahead | back) for ahead, back in has]
     rests = [_rest(maps[i], looked[i][0], unmatched[i]) for i in (0, 1)]
     again = [_looked_up_again(maps[i], looked[i][0], unmatched[i], rests[1 - i], options) for i in (0, 1)]
-    has_again = _both_ways([[one, one] for one in again], ways)
+    has_again = _both_ways([[one, one] for one in again], ways, maps, options)
     results = []
     for i in (0, 1):
         found = tuple(_filled(first, again[i], unmatched[i]) for first in looked[i])
         late = tuple(before | (now & unmatched[i]) for before, now in zip(has[i], has_again[i], strict=True))
         results.append(Mutual((found[0], found[1]), (late[0], late[1])))
     return results[0], results[1]
+
+
+def _can_be(found: Counterparts, other: Roads, way: int, options: OverlapOptions) -> NDArray[np.bool_]:
+    """Tell which counterparts can be true: a road that lies aside and is driven the other way is another road."""
+    there = other.sense[np.maximum(found.other, 0)] * np.where(found.along, way, -way)
+    return (found.other >= 0) & ~((there < 0) & (found.distance > options.against))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +114,19 @@ class _Rest:
 
 
 def _both_ways(
-    looked: Sequence[Sequence[Counterparts]], ways: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]]
+    looked: Sequence[Sequence[Counterparts]],
+    ways: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]],
+    maps: Sequence[Roads],
+    options: OverlapOptions,
 ) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
     """Tell of each map which places have a mutual counterpart, along the lines and against them."""
-    used = [[ways[i][way][looked[i][way].edge] & (looked[i][way].other >= 0) for way in (0, 1)] for i in (0, 1)]
+    used = [
+        [
+            ways[i][way][looked[i][way].edge] & _can_be(looked[i][way], maps[1 - i], 1 - 2 * way, options)
+            for way in (0, 1)
+        ]
+        for i in (0, 1)
+    ]
     has = [[used[i][way] & _comes_back(looked[i][way], looked[1 - i], used[1 - i]) for way in (0, 1)] for i in (0, 1)]
     return [(ahead, back) for ahead, back in has]
 
@@ -138,7 +155,7 @@ def _looked_up_again(
     xy, _ = locate(roads.network, edge, offset)
     direction = direction_over(roads.network, edge, offset, options.span)
     stretch, at = project_along(
-        xy, direction, rest.network, radius=options.radius, max_angle=options.max_angle, span=options.span
+        xy, direction, rest.network, radius=min(options.radius, _AGAIN), max_angle=options.max_angle, span=options.span
     )
     on = stretch >= 0
     n = len(places.edge)

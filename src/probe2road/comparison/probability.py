@@ -20,17 +20,17 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     "added": ("log_support", "log_length"),
     "suspect_closed": ("log_expected",),
     "direction_changed": ("log_odds",),
-    "connection_added": ("log_count", "loose"),
+    "connection_added": ("log_count", "dead_end"),
     "connection_missing": ("log_expected", "crosses"),
 }  # what each model weighs
 
 _COEFFICIENTS: Mapping[str, tuple[float, ...]] = {
-    "moved": (-9.89, 0.45, 0.44, 1.01),
-    "added": (1.63, 0.39, -0.06),
-    "suspect_closed": (-3.44, 1.21),
-    "direction_changed": (-2.02, 0.45),
-    "connection_added": (-1.34, 0.38, 2.44),
-    "connection_missing": (0.1, -0.24, 3.11),
+    "moved": (-9.25, 0.51, 0.13, 0.88),
+    "added": (-0.03, 0.3, 0.25),
+    "suspect_closed": (-2.61, 0.87),
+    "direction_changed": (-1.75, 0.51),
+    "connection_added": (-1.01, 0.16, 3.57),
+    "connection_missing": (-0.08, -0.16, 3.12),
 }  # the constant, and one for each feature
 
 _NEAR = 60.0  # m within which the dead end of a road may be the reason why two roads are not joined
@@ -43,8 +43,8 @@ def evidence_features(evidence: pd.DataFrame) -> pd.DataFrame:
     Parameters
     ----------
     evidence
-        Any of ``distance`` (m), ``nearest``, ``support``, ``length`` (m), ``expected``, ``count``, ``crosses``, ``odds``
-        (a probability) and ``dead_end_distance`` (m).
+        Any of ``distance`` (m), ``nearest``, ``support``, ``length`` (m), ``expected``, ``count``, ``crosses``,
+        ``odds`` (a probability) and ``dead_end_distance`` (m).
 
     Examples
     --------
@@ -64,10 +64,8 @@ def evidence_features(evidence: pd.DataFrame) -> pd.DataFrame:
         made["log_odds"] = np.clip(np.log(odds / (1 - odds)), -_MOST_ODDS, _MOST_ODDS)
     if "crosses" in evidence:
         made["crosses"] = evidence["crosses"].to_numpy(np.float64, na_value=0.0)
-    if "dead_end_distance" in evidence:  # the roads of the map end there, or cross, but do not meet
-        loose = evidence["dead_end_distance"].to_numpy(np.float64) <= _NEAR
-        crosses = evidence["crosses"].to_numpy(bool, na_value=False) if "crosses" in evidence else False
-        made["loose"] = (loose | crosses).astype(np.float64)
+    if "dead_end_distance" in evidence:
+        made["dead_end"] = (evidence["dead_end_distance"].to_numpy(np.float64) <= _NEAR).astype(np.float64)
     return pd.DataFrame(made, index=evidence.index)
 
 
