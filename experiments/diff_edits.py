@@ -38,6 +38,7 @@ from probe2road.metrics.network import Network, network_from_graph
 KINDS = ("remove", "add", "shift", "reverse", "disconnect", "join")
 SHORTEST = {"remove": 60.0, "shift": 150.0, "reverse": 60.0, "disconnect": 80.0}  # m of an edge that is edited so
 DRIVEN = 4  # drives that the shipped build needs before it keeps a road
+LONG = 150.0  # m of an edited road, from which on it is long
 NEAR = 60.0  # m from an edit at a place to the row that finds it
 COVERED = 0.5  # share of an edited road that the rows must cover
 FOUND_AS = {
@@ -307,6 +308,7 @@ def report(
     found: gpd.GeoDataFrame, true: NDArray[np.bool_], edits: gpd.GeoDataFrame, hit: NDArray[np.bool_]
 ) -> pd.DataFrame:
     """Return precision and recall by kind of edit."""
+    long = edits["kind"].isin(["disconnect", "join"]).to_numpy() | (edits.geometry.length >= LONG).to_numpy()
     rows, there = [], edits["in_graph"].to_numpy(bool)
     for kind, changes in FOUND_AS.items():
         listed = found["change"].isin(changes).to_numpy()
@@ -324,6 +326,8 @@ def report(
                 "recall of driven": hit[seen].mean() if seen.any() else np.nan,
                 "in the graph": int((seen & there).sum()),
                 "recall in the graph": hit[seen & there].mean() if (seen & there).any() else np.nan,
+                "long": int((seen & there & long).sum()),
+                "recall of long": hit[seen & there & long].mean() if (seen & there & long).any() else np.nan,
             }
         )
     return pd.DataFrame(rows)

@@ -27,7 +27,7 @@ from probe2road.metrics.projection import direction_over, project_along
 __all__ = ["Mutual", "mutual", "pieces"]
 
 _BACK = 12.0  # m along a road, within which a place that is looked up from the other map must come back
-_AGAIN = 15.0  # m to what is left of the other map, at most
+_AGAIN = 15.0  # m to a road that is left of the other map, at most
 _SOME = 0.1  # share of the traversals in one direction, from which on a road is looked up in it
 
 
@@ -88,7 +88,8 @@ def mutual(ours: Roads, theirs: Roads, options: OverlapOptions) -> tuple[Mutual,
     has = _both_ways(looked, ways, maps, options)
     unmatched = [~(ahead | back) for ahead, back in has]
     rests = [_rest(maps[i], looked[i][0], unmatched[i]) for i in (0, 1)]
-    again = [_looked_up_again(maps[i], looked[i][0], unmatched[i], rests[1 - i], options) for i in (0, 1)]
+    known = [_pairs(looked[i], has[i]) for i in (0, 1)]
+    again = [_looked_up_again(maps[i], looked[i][0], unmatched[i], rests[1 - i], known[i], options) for i in (0, 1)]
     has_again = _both_ways([[one, one] for one in again], ways, maps, options)
     results = []
     for i in (0, 1):
@@ -146,18 +147,35 @@ def _rest(roads: Roads, places: Counterparts, unmatched: NDArray[np.bool_]) -> _
     return _Rest(network_from_graph(graph_from_lines(lines, crs=roads.graph.crs)), edge, begin)
 
 
+def _pairs(looked: Sequence[Counterparts], has: Sequence[NDArray[np.bool_]]) -> pd.MultiIndex:
+    """Return the pairs of edges that have places in common."""
+    pairs = [(found.edge[on], found.other[on]) for found, on in zip(looked, has, strict=True)]
+    return pd.MultiIndex.from_arrays([np.concatenate(side) for side in zip(*pairs, strict=True)]).unique()
+
+
 def _looked_up_again(
-    roads: Roads, places: Counterparts, unmatched: NDArray[np.bool_], rest: _Rest, options: OverlapOptions
+    roads: Roads,
+    places: Counterparts,
+    unmatched: NDArray[np.bool_],
+    rest: _Rest,
+    known: pd.MultiIndex,
+    options: OverlapOptions,
 ) -> Counterparts:
-    """Look up the places without a counterpart on what is left of the other map, whichever way it is driven."""
+    """Look up the places without a counterpart on what is left of the other map, whichever way it is driven.
+
+    It has to be nearer than in the first lookup, but for pairs of edges that were found to be the same road elsewhere.
+    """
     rows = np.flatnonzero(unmatched)
     edge, offset = places.edge[rows], places.offset[rows]
     xy, _ = locate(roads.network, edge, offset)
     direction = direction_over(roads.network, edge, offset, options.span)
     stretch, at = project_along(
-        xy, direction, rest.network, radius=min(options.radius, _AGAIN), max_angle=options.max_angle, span=options.span
+        xy, direction, rest.network, radius=options.radius, max_angle=options.max_angle, span=options.span
     )
     on = stretch >= 0
+    there, _ = locate(rest.network, stretch[on], at[on])
+    same = pd.MultiIndex.from_arrays([edge[on], rest.edge[stretch[on]]]).isin(known)
+    on[on] = same | (np.hypot(*(there - xy[on]).T) <= _AGAIN)
     n = len(places.edge)
     other, other_offset = np.full(n, -1, np.int64), np.zeros(n)
     distance, along = np.full(n, np.nan), np.zeros(n, bool)

@@ -25,11 +25,11 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
 }  # what each model weighs
 
 _COEFFICIENTS: Mapping[str, tuple[float, ...]] = {
-    "moved": (-9.25, 0.51, 0.13, 0.88),
-    "added": (-0.03, 0.3, 0.25),
+    "moved": (-9.29, 0.51, 0.18, 0.88),
+    "added": (0.74, 0.33, 0.1),
     "suspect_closed": (-2.61, 0.87),
     "direction_changed": (-1.75, 0.51),
-    "connection_added": (-1.01, 0.16, 3.57),
+    "connection_added": (-1.0, 0.15, 3.57),
     "connection_missing": (-0.08, -0.16, 3.12),
 }  # the constant, and one for each feature
 
