@@ -5,6 +5,7 @@ from . import baselines as baselines
 from . import benchmark as benchmark
 from . import bounds as bounds
 from . import cli as cli
+from . import comparison as comparison
 from . import crs as crs
 from . import demo as demo
 from . import draw as draw
@@ -29,6 +30,12 @@ from .alignment.align import add_drives as add_drives
 from .alignment.align import align as align
 from .alignment.options import AlignOptions as AlignOptions
 from .alignment.report import AlignmentReport as AlignmentReport
+from .comparison.diff import DiffOptions as DiffOptions
+from .comparison.diff import diff as diff
+from .comparison.identity import IdentityOptions as IdentityOptions
+from .comparison.identity import keep_ids as keep_ids
+from .comparison.overlap import OverlapOptions as OverlapOptions
+from .comparison.proposals import write_diff as write_diff
 from .draw.view import view as view
 from .errors import Probe2RoadError as Probe2RoadError
 from .fleet.contract import Fleet as Fleet
@@ -79,6 +86,7 @@ from .recipe import build as build
 from .refinement.centreline import CentrelineOptions as CentrelineOptions
 from .refinement.evidence import EvidenceOptions as EvidenceOptions
 from .refinement.faint import FaintOptions as FaintOptions
+from .refinement.gaps.driven import DrivenOptions as DrivenOptions
 from .refinement.gaps.links import GapOptions as GapOptions
 from .refinement.heights import HeightOptions as HeightOptions
 from .refinement.junctions.braids import BraidOptions as BraidOptions

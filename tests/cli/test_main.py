@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pandas as pd
 import pytest
 
 from probe2road.cli.main import main
-from probe2road.io.graph_files import read_graph
+from probe2road.io.graph_files import read_graph, write_graph
 
 
 def run(*arguments, cwd):
@@ -114,6 +115,17 @@ def test_intermediate_stages_are_kept_on_request(folder, call):
     assert "stages.png" in names
 
 
+def test_a_build_takes_over_the_ids_of_an_earlier_one(folder, built, call):
+    graph = read_graph(folder / "roads.gpkg")
+    renamed = graph.edges.set_axis(graph.edges.index + 700).rename_axis("edge")
+    turns = graph.turns.assign(from_edge=graph.turns["from_edge"] + 700, to_edge=graph.turns["to_edge"] + 700)
+    write_graph(replace(graph, edges=renamed, turns=turns), folder / "earlier.gpkg")
+    options = ["--ids-from", "earlier.gpkg", "--id-changes", "ids.csv"]
+    assert call("build", "drives.csv", *COLUMNS, *options, "-o", "later.gpkg")[0] == 0
+    assert read_graph(folder / "later.gpkg").edges.index.tolist() == (graph.edges.index + 700).tolist()
+    assert pd.read_csv(folder / "ids.csv")["change"].tolist() == ["kept"] * len(graph.edges)
+
+
 def test_options_come_from_toml(folder, call):
     (folder / "build.toml").write_text("[segmentation.density]\nbandwidth = 6\n[clean]\ndead_end = 400\n")
     code, _, err = call("build", "drives.csv", *COLUMNS, "--config", "build.toml", "-o", "toml.gpkg", "--no-refine")
@@ -127,6 +139,7 @@ def test_options_come_from_toml(folder, call):
         (["build", "absent.csv", "-o", "x.gpkg"], "absent.csv: there is no such file"),
         (["build", "drives.csv", "-o", "x.gpkg"], "column"),
         (["build", "drives.csv", *COLUMNS[:2], "-o", "x.gpkg"], "no CRS"),
+        (["build", "drives.csv", *COLUMNS, "--id-changes", "a.csv", "-o", "x.gpkg"], "there are no earlier ids"),
         (["build", "drives.csv", *COLUMNS, "-o", "x.dxf"], "suffix is of no known format"),
         (["build", "drives.csv", *COLUMNS, "-o", "absent/x.gpkg"], "does not exist; create it first"),
         (["build", "drives.csv", *COLUMNS, "--bbox", "1,2,3", "-o", "x.gpkg"], "left,bottom,right,top"),

@@ -16,7 +16,7 @@ from probe2road.io.graph_files import read_graph
 
 Call = Callable[..., tuple[int, str]]
 
-FIXES = ["trace_id", "t", "edge", "offset", "distance", "forward", "reason"]
+FIXES = ["trace_id", "t", "edge", "offset", "at", "distance", "forward", "reason"]
 READ = ("--columns", "trace_id=trip,t=clock,x=e,y=n", "--crs", "EPSG:32616")
 
 

@@ -59,7 +59,7 @@ def test_steps_say_where_a_traversal_begins_and_ends() -> None:
     assert found.steps["via_node"].isna().tolist() == [True, False]
     assert found.steps["t_first"].iloc[0] == found.fixes["t"].iloc[0]
     assert found.steps["t_last"].iloc[1] == found.fixes["t"].iloc[-1]
-    assert list(found.fixes) == ["trace_id", "t", "edge", "offset", "distance", "forward", "reason"]
+    assert list(found.fixes) == ["trace_id", "t", "edge", "offset", "at", "distance", "forward", "reason"]
     assert [str(found.fixes[column].dtype) for column in ("edge", "forward", "reason")] == [
         "Int64",
         "boolean",
@@ -72,6 +72,7 @@ def test_offsets_run_from_u_whichever_way_the_edge_is_driven() -> None:
     for xy in ([(20, 1), (50, 1), (80, 1)], [(80, 1), (50, 1), (20, 1)]):
         found = match(graph, fleet_of(xy))
         assert found.fixes["offset"].tolist() == [x for x, _ in xy]
+        assert found.fixes["at"].tolist() == [x / 100 for x, _ in xy]
         assert found.fixes["distance"].tolist() == [1.0, 1.0, 1.0]
         assert found.fixes["forward"].eq(xy[0][0] == 20).all()
 

@@ -90,6 +90,15 @@ def build(
     min_vehicles: Annotated[int, typer.Option(help="Vehicles that an edge needs to be written.")] = 1,
     min_drives: Annotated[int, typer.Option(help="Drives that an edge needs to be written.")] = 1,
     first_id: Annotated[int, typer.Option(help="First id in OSM files for routing engines (.osm.pbf).")] = 1,
+    ids_from: Annotated[
+        Path | None, typer.Option(help="Earlier graph, whose ids are kept where the road is the same.")
+    ] = None,
+    first_new_id: Annotated[
+        int | None, typer.Option(help="With --ids-from: new ids are at least this; above all earlier ones without it.")
+    ] = None,
+    id_changes: Annotated[
+        Path | None, typer.Option(help="With --ids-from: table of what was kept, split, merged, moved, new and gone.")
+    ] = None,
     config: Annotated[Path | None, typer.Option(help="TOML file with build options, and how to read.")] = None,
     keep_intermediate: Annotated[
         Path | None, typer.Option(help="Folder that keeps what every stage made, and a picture of it.")
@@ -99,17 +108,23 @@ def build(
 
     An interrupted run goes on where it stopped when it is started again.
     """
+    from probe2road.comparison.identity import keep_ids
     from probe2road.draw.stages import draw_stages
     from probe2road.graph.disclosure import withhold
     from probe2road.io.fleet_reader import read_fleet
-    from probe2road.io.graph_files import graph_format, write_graph
+    from probe2road.io.graph_files import graph_format, read_graph, write_graph
     from probe2road.io.osm_writer import OsmOptions
+    from probe2road.io.table_writer import require_table_suffix, write_table
     from probe2road.options import options_from_table, read_toml
     from probe2road.recipe import BuildOptions
     from probe2road.recipe import build as build_graph
     from probe2road.run.workspace import resumable
 
-    _require_places(*output)
+    _require_places(*output, id_changes)
+    if id_changes is not None:
+        require_table_suffix(id_changes)
+    if ids_from is None and (id_changes is not None or first_new_id is not None):
+        raise OptionError("there are no earlier ids", where="build", fix="name the earlier graph with --ids-from")
     for path in output:
         graph_format(path)
     _require_folders(keep_intermediate)
@@ -122,11 +137,16 @@ def build(
     given = {name: value for name, value in chosen.items() if value is not None}
     options = replace(options, segmentation=replace(options.segmentation, **given), refine=options.refine and refine)
 
+    earlier = read_graph(ids_from) if ids_from else None
     fleet = read_fleet(traces, points, format=format)
     keeping = nullcontext(keep_intermediate) if keep_intermediate else resumable(output[0])
     with keeping as workspace, progress_bar() as progress:
         graph = build_graph(fleet, options=options, workspace=workspace, progress=progress)
         graph = withhold(graph, min_vehicles=min_vehicles, min_drives=min_drives)
+        if earlier is not None:
+            graph, changes = keep_ids(graph, earlier, first_new=first_new_id)
+            if id_changes is not None:
+                write_table(changes, id_changes, layer="changes")
         for path in output:
             write_graph(graph, path, osm=osm)
     if keep_intermediate:
@@ -271,6 +291,48 @@ def evaluate(
     _print_scores(scores)
     if not scores[["precision", "recall"]].any(axis=None):
         raise typer.Exit(_NOTHING)
+
+
+@app.command()
+@takes(graph_format=graph_options, reference_format=reference_options)
+def diff(
+    graph: Annotated[Path, typer.Argument(help="Road graph built from drives.")],
+    base: Annotated[Path, typer.Argument(help="Map to compare it with: OSM, a GIS file, or another road graph.")],
+    output: Annotated[
+        list[Path],
+        typer.Option(
+            "--output",
+            "-o",
+            help="File to write: .osc for JOSM, .geojsons for MapRoulette, or a table. May be repeated. " + _TABLES,
+        ),
+    ],
+    *,
+    graph_format: Said[GraphFormat],
+    reference_format: Said[GraphFormat],
+    min_probability: Annotated[
+        float | None, typer.Option(help="Of a difference, from which on it is listed; 0.5 without it.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file with options of the comparison.")] = None,
+) -> None:
+    """Compare a road graph with a map: what it confirms, what the map lacks, and what may be wrong on it."""
+    from probe2road.comparison.diff import DIFFERENCES, DiffOptions
+    from probe2road.comparison.diff import diff as compare
+    from probe2road.comparison.proposals import require_diff_suffix, write_diff
+    from probe2road.options import options_from_table, read_toml
+
+    _require_places(*output)
+    for path in output:
+        require_diff_suffix(path)
+    options = options_from_table(read_toml(config) if config else {}, DiffOptions, where=config)
+    options = replace(options, min_probability=min_probability) if min_probability is not None else options
+    ours = read_roads(graph, graph_format)
+    changes = compare(ours, read_roads(base, reference_format), options=options)
+    for path in output:
+        write_diff(changes, path)
+    for name in DIFFERENCES:
+        rows = changes[changes["change"] == name]
+        kilometres = f"{rows['length'].sum() / 1000:9.1f} km" if "connection" not in name else ""
+        typer.echo(f"{name:20}{len(rows):7}{kilometres}")
 
 
 @app.command()

@@ -36,6 +36,7 @@ __all__ = [
     "oneway_probabilities",
     "tagged_direction",
     "told_direction",
+    "turned",
 ]
 
 WAYS = (1, -1, 0)  # from u to v only, from v to u only, both: the columns of `oneway_probabilities`
@@ -242,19 +243,37 @@ def in_driving_direction(edges: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     ([[1, 0, 'yes']], 'LINESTRING (9 0, 0 0)')
     """
     against = (driving_direction(edges) == -1).to_numpy()
-    if not against.any():
-        return edges
+    return turned(edges, against) if against.any() else edges
+
+
+def turned(edges: gpd.GeoDataFrame, rows: NDArray[np.bool_]) -> gpd.GeoDataFrame:
+    """Reverse some edges: their ends, lines and the columns of their sides, as `in_driving_direction` does.
+
+    Parameters
+    ----------
+    edges
+        Edge table. Edges that are open from v to u only must be among those that are turned.
+    rows
+        Shape (E,): which edges.
+
+    Examples
+    --------
+    >>> from probe2road.graph.roadgraph import graph_from_lines
+    >>> edges = graph_from_lines([[(0, 0), (9, 0)]], crs="EPSG:32616").edges.assign(forward=4, backward=1)
+    >>> turned(edges, np.array([True]))[["u", "v", "forward", "backward"]].values.tolist()
+    [[1, 0, 1, 4]]
+    """
     lines = edges.geometry.to_numpy().copy()
-    lines[against] = shapely.reverse(lines[against])
+    lines[rows] = shapely.reverse(lines[rows])
     opposite = {name: _other_side(name) for name in edges if isinstance(name, str)} | {"u": "v", "v": "u"}
-    turned: dict[str, Any] = {
-        name: edges[name].mask(against, edges[other])
+    swapped: dict[str, Any] = {
+        name: edges[name].mask(rows, edges[other])
         for name, other in opposite.items()
         if other != name and other in edges
     }
     if "oneway" in edges:
-        turned["oneway"] = _turned_words(edges["oneway"])
-    return edges.assign(**turned).set_geometry(lines, crs=edges.crs)
+        swapped["oneway"] = _turned_words(edges["oneway"])
+    return edges.assign(**swapped).set_geometry(lines, crs=edges.crs)
 
 
 def _other_side(name: str) -> str:

@@ -60,8 +60,9 @@ class Matches:
     ----------
     fixes
         One row per fix, in the order of the traces: ``trace_id``, ``t``, ``edge`` (Int64, NA where unmatched),
-        ``offset`` (m along the edge from u, in plan), ``distance`` (m), ``forward`` (boolean: driven from u to v),
-        ``reason`` (category: why there is no edge; missing where there is one).
+        ``offset`` (m along the edge from u, in plan), ``at`` (the same in 0 to 1: with ``edge`` and ``forward`` a
+        reference that outlives a small change of the line, see `probe2road.keep_ids`), ``distance`` (m), ``forward``
+        (boolean: driven from u to v), ``reason`` (category: why there is no edge; missing where there is one).
     steps
         The matched paths, one row per traversal of an edge: ``trace_id``, ``position`` (0, 1, ... in the trace),
         ``edge``, ``forward``, ``entered`` (the trace came over the start node of the traversal), ``left`` (it went on

@@ -97,12 +97,15 @@ def fix_table(
     edge_id = graph.edges.index.to_numpy()
     edge = np.zeros(len(matched), np.int64)
     edge[matched] = edge_id[state[matched] >> 1]
+    length = np.full(len(matched), np.nan)
+    length[matched] = np.maximum(states.length[state[matched] >> 1], 1e-9)  # an edge may be a point
     return pd.DataFrame(
         {
             "trace_id": fleet.traces["trace_id"].array,
             "t": fleet.traces["t"].array,
             "edge": pd.arrays.IntegerArray(edge, ~matched),
             "offset": np.where(matched, paths.along, np.nan),
+            "at": np.where(matched, np.clip(paths.along / length, 0.0, 1.0), np.nan),
             "distance": np.where(matched, paths.distance, np.nan),
             "forward": pd.arrays.BooleanArray(state & 1 == 0, ~matched),
             "reason": _reasons(fleet, states, paths, radius, stray),

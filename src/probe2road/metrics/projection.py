@@ -19,6 +19,8 @@ def project_along(
     radius: float,
     max_angle: float,
     span: float = 0.0,
+    sense: NDArray[np.int64] | None = None,
+    against: float = 0.0,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Find the nearest edge in each point's direction, and the position on it to which the point projects.
 
@@ -37,6 +39,12 @@ def project_along(
         Largest angle between the directions as undirected lines, degrees.
     span
         Metres to either side over which the direction of an edge is taken; 0 for the segment alone.
+    sense
+        Shape (E,): which way the edges may be driven, 1 along their line, -1 against it, 0 both ways. Then the
+        directions of the points are driving directions.
+    against
+        Metres that are added to the distance of an edge which may only be driven the other way. An edge beside it that
+        may be driven takes its place, if it is that little farther; within the radius, both are.
 
     Returns
     -------
@@ -53,6 +61,13 @@ def project_along(
     >>> point, east = np.array([[19.0, 0.0]]), np.array([[1.0, 0.0]])
     >>> [part.tolist() for part in project_along(point, east, network, radius=6.0, max_angle=30.0)]
     [[1], [19.0]]
+
+    Of two carriageways, the nearer one is driven the other way:
+
+    >>> network = network_from_graph(graph_from_lines([[(50, 2), (0, 2)], [(0, -5), (50, -5)]], crs="EPSG:32616"))
+    >>> ways = {"sense": np.array([1, 1]), "against": 8.0}
+    >>> project_along(point, east, network, radius=10.0, max_angle=30.0, **ways)[0].tolist()
+    [1]
     """
     edge, offset = np.full(len(xy), -1, np.int64), np.zeros(len(xy))
     if len(xy) == 0 or len(network.lines) == 0:
@@ -60,10 +75,12 @@ def project_along(
     points = shapely.points(xy)
     row, candidate = shapely.STRtree(network.lines).query(points, predicate="dwithin", distance=radius + EPSILON)
     along = shapely.line_locate_point(network.lines[candidate], points[row])
-    cosine = np.abs((direction_over(network, candidate, along, span) * direction[row]).sum(axis=1))
-    aligned = cosine >= np.cos(np.radians(max_angle)) - 1e-9
-    row, candidate, along = row[aligned], candidate[aligned], along[aligned]
+    cosine = (direction_over(network, candidate, along, span) * direction[row]).sum(axis=1)
+    aligned = np.abs(cosine) >= np.cos(np.radians(max_angle)) - 1e-9
+    row, candidate, along, cosine = row[aligned], candidate[aligned], along[aligned], cosine[aligned]
     gap = np.round(np.hypot(*(locate(network, candidate, along)[0] - xy[row]).T), 6)
+    if sense is not None:
+        gap += against * (sense[candidate] * cosine < 0)
     order = np.lexsort((candidate, gap, row))
     kept = order[np.unique(row[order], return_index=True)[1]]
     edge[row[kept]], offset[row[kept]] = candidate[kept], along[kept]
