@@ -30,9 +30,12 @@ from .alignment.align import add_drives as add_drives
 from .alignment.align import align as align
 from .alignment.options import AlignOptions as AlignOptions
 from .alignment.report import AlignmentReport as AlignmentReport
+from .comparison.diff import DiffOptions as DiffOptions
+from .comparison.diff import diff as diff
 from .comparison.identity import IdentityOptions as IdentityOptions
 from .comparison.identity import keep_ids as keep_ids
 from .comparison.overlap import OverlapOptions as OverlapOptions
+from .comparison.proposals import write_diff as write_diff
 from .draw.view import view as view
 from .errors import Probe2RoadError as Probe2RoadError
 from .fleet.contract import Fleet as Fleet

@@ -294,6 +294,48 @@ def evaluate(
 
 
 @app.command()
+@takes(graph_format=graph_options, reference_format=reference_options)
+def diff(
+    graph: Annotated[Path, typer.Argument(help="Road graph built from drives.")],
+    base: Annotated[Path, typer.Argument(help="Map to compare it with: OSM, a GIS file, or another road graph.")],
+    output: Annotated[
+        list[Path],
+        typer.Option(
+            "--output",
+            "-o",
+            help="File to write: .osc for JOSM, .geojsons for MapRoulette, or a table. May be repeated. " + _TABLES,
+        ),
+    ],
+    *,
+    graph_format: Said[GraphFormat],
+    reference_format: Said[GraphFormat],
+    min_probability: Annotated[
+        float | None, typer.Option(help="Of a difference, from which on it is listed; 0.5 without it.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file with options of the comparison.")] = None,
+) -> None:
+    """Compare a road graph with a map: what it confirms, what the map lacks, and what may be wrong on it."""
+    from probe2road.comparison.diff import DIFFERENCES, DiffOptions
+    from probe2road.comparison.diff import diff as compare
+    from probe2road.comparison.proposals import require_diff_suffix, write_diff
+    from probe2road.options import options_from_table, read_toml
+
+    _require_places(*output)
+    for path in output:
+        require_diff_suffix(path)
+    options = options_from_table(read_toml(config) if config else {}, DiffOptions, where=config)
+    options = replace(options, min_probability=min_probability) if min_probability is not None else options
+    ours = read_roads(graph, graph_format)
+    changes = compare(ours, read_roads(base, reference_format), options=options)
+    for path in output:
+        write_diff(changes, path)
+    for name in DIFFERENCES:
+        rows = changes[changes["change"] == name]
+        kilometres = f"{rows['length'].sum() / 1000:9.1f} km" if "connection" not in name else ""
+        typer.echo(f"{name:20}{len(rows):7}{kilometres}")
+
+
+@app.command()
 @takes(
     fleet_format=fleet_options,
     graph_format=graph_options,

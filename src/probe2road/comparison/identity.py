@@ -94,9 +94,9 @@ def keep_ids(
     >>> lines = [[(100, 0.5), (100, 90)], [(100, 0.5), (300, 0.5)], [(0, 0.5), (100, 0.5)]]
     >>> graph, changes = keep_ids(graph_from_lines(lines, crs="EPSG:32616"), earlier)
     >>> graph.edges["length"].to_dict()
-    {0: 200.0, 1: 89.5, 2: 100.0}
+    {0: 200.0, 1: 100.0, 2: 89.5}
     >>> changes[["change", "edge", "earlier"]].values.tolist()
-    [['split', 0, 0], ['split', 2, 0], ['new', 1, <NA>]]
+    [['split', 0, 0], ['split', 1, 0], ['new', 2, <NA>]]
     """
     options = options or IdentityOptions()
     earlier = earlier.to_crs(graph.crs)

@@ -159,6 +159,7 @@ def graph_from_edge_table(
         If a column cannot be converted, or the graph breaks an invariant.
     """
     require_lines(table, where=where)
+    _require_ids(table, where=where)
     with parsing(where, "the columns of the edges are damaged", fix="write it again"):
         turns = _turns_from_text(table) if turns is None else turns[list(TURN_DTYPES)].astype(TURN_DTYPES)
         edges = (
@@ -177,6 +178,17 @@ def graph_from_edge_table(
     graph = RoadGraph(nodes, edges, turns)
     require_sound(graph, where=where)
     return graph
+
+
+def _require_ids(table: pd.DataFrame, *, where: object) -> None:
+    """Refuse ids that 64 bits do not hold: they would be turned into others."""
+    for name in ("edge", "u", "v"):
+        values = table[name]
+        if pd.api.types.is_numeric_dtype(values.dtype) and len(values):
+            largest = pd.Series([values.min(), values.max()]).astype("float64").abs().max()
+            if not largest < 2.0**63:
+                fault = f"column {name!r} holds ids beyond 2**63"
+                raise InputError(fault, where=where, fix="number the edges and nodes anew")
 
 
 def require_finite(table: gpd.GeoDataFrame, *, where: object) -> None:

@@ -24,7 +24,15 @@ from probe2road.metrics.projection import direction_over, project_along
 from probe2road.metrics.scores import Score
 from probe2road.options import checked
 
-__all__ = ["JunctionOptions", "JunctionPairs", "junction_pairs", "junctions", "junctions_networks"]
+__all__ = [
+    "JunctionOptions",
+    "JunctionPairs",
+    "crossings_without_node",
+    "junction_pairs",
+    "junctions",
+    "junctions_networks",
+    "routes_within",
+]
 
 _BATCH = 512  # nodes from which distances are computed at a time; limits memory
 
@@ -152,7 +160,7 @@ def junctions_networks(proposal: Network, reference: Network, options: JunctionO
 
 def junction_pairs(proposal: Network, reference: Network, options: JunctionOptions) -> JunctionPairs:
     """Return for every pair of arms of the reference whether each network connects it, for maps and resampling."""
-    i, j, crossing_xy = _crossings(reference, options.same_node)
+    i, j, crossing_xy = crossings_without_node(reference, options.same_node)
     arms = _arms(reference, i, j, crossing_xy, options.arm)
     one, other = _pairs(arms.place)
     limit = options.detour * (arms.reach[one] + arms.reach[other]) + options.slack
@@ -163,8 +171,8 @@ def junction_pairs(proposal: Network, reference: Network, options: JunctionOptio
     )
     return JunctionPairs(
         xy=np.concatenate([reference.node_xy, crossing_xy])[arms.place[one]],
-        true=_connected(reference, arms.edge, arms.offset, one, other, limit),
-        said=_connected(proposal, edge, offset, one, other, limit),
+        true=routes_within(reference, arms.edge, arms.offset, one, other, limit),
+        said=routes_within(proposal, edge, offset, one, other, limit),
         junctions=int(np.count_nonzero(reference.degree > 2)),
         crossings=len(crossing_xy),
         arms=len(arms.place),
@@ -172,8 +180,18 @@ def junction_pairs(proposal: Network, reference: Network, options: JunctionOptio
     )
 
 
-def _crossings(network: Network, same_node: float) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Find where two edges without a common node cross in plan: their rows and the points, shape (X, 2)."""
+def crossings_without_node(
+    network: Network, same_node: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Find where two edges cross in plan without sharing a node nearby: their rows, and the points, shape (X, 2).
+
+    Parameters
+    ----------
+    network
+        The graph.
+    same_node
+        Metres; a crossing this close to a common node of the two is none.
+    """
     lines = network.lines
     i, j = shapely.STRtree(lines).query(lines, predicate="intersects")
     i, j = i[i < j], j[i < j]
@@ -220,7 +238,7 @@ def _pairs(place: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int6
     return one, one + 1 + np.arange(len(one)) - np.repeat(np.cumsum(later) - later, later)
 
 
-def _connected(
+def routes_within(
     network: Network,
     edge: NDArray[np.int64],
     offset: NDArray[np.float64],
@@ -228,7 +246,19 @@ def _connected(
     other: NDArray[np.int64],
     limit: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Tell which pairs of positions are connected by a route within the pair's limit; edge -1 is never connected."""
+    """Tell which pairs of positions are connected by a route within the pair's limit, in whatever direction.
+
+    Parameters
+    ----------
+    network
+        The graph.
+    edge, offset
+        Shape (A,): positions; edge -1 is nowhere, and connected to nothing.
+    one, other
+        Shape (K,): the rows of the two positions of each pair.
+    limit
+        Shape (K,): the longest route that counts, metres.
+    """
     connected = np.zeros(len(one), bool)
     found = np.flatnonzero((edge[one] >= 0) & (edge[other] >= 0))
     if len(found) == 0:
