@@ -126,6 +126,19 @@ def test_a_build_takes_over_the_ids_of_an_earlier_one(folder, built, call):
     assert pd.read_csv(folder / "ids.csv")["change"].tolist() == ["kept"] * len(graph.edges)
 
 
+def test_diff_lists_what_a_map_lacks(folder, built, call):
+    graph = read_graph(folder / "roads.gpkg")
+    graph.edges.iloc[:1][["geometry"]].to_file(folder / "one-road.gpkg")
+    code, out, _ = call("diff", "roads.gpkg", "one-road.gpkg", "-o", "changes.csv", "-o", "changes.osc")
+    assert code == 0
+    changes = pd.read_csv(folder / "changes.csv")
+    assert set(changes["change"]) == {"confirmed", "added"}
+    printed = dict(line.split()[:2] for line in out.splitlines())
+    assert printed["added"] == str((changes["change"] == "added").sum())
+    assert printed["undriven"] == "0"
+    assert "osmChange" in (folder / "changes.osc").read_text()
+
+
 def test_options_come_from_toml(folder, call):
     (folder / "build.toml").write_text("[segmentation.density]\nbandwidth = 6\n[clean]\ndead_end = 400\n")
     code, _, err = call("build", "drives.csv", *COLUMNS, "--config", "build.toml", "-o", "toml.gpkg", "--no-refine")
@@ -140,6 +153,8 @@ def test_options_come_from_toml(folder, call):
         (["build", "drives.csv", "-o", "x.gpkg"], "column"),
         (["build", "drives.csv", *COLUMNS[:2], "-o", "x.gpkg"], "no CRS"),
         (["build", "drives.csv", *COLUMNS, "--id-changes", "a.csv", "-o", "x.gpkg"], "there are no earlier ids"),
+        (["diff", "roads.gpkg", "roads.gpkg", "-o", "x.dxf"], "no table is written to .dxf"),
+        (["diff", "roads.gpkg", "roads.gpkg", "--min-probability", "2", "-o", "x.gpkg"], "min_probability is 2"),
         (["build", "drives.csv", *COLUMNS, "-o", "x.dxf"], "suffix is of no known format"),
         (["build", "drives.csv", *COLUMNS, "-o", "absent/x.gpkg"], "does not exist; create it first"),
         (["build", "drives.csv", *COLUMNS, "--bbox", "1,2,3", "-o", "x.gpkg"], "left,bottom,right,top"),

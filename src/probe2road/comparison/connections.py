@@ -258,8 +258,8 @@ def dead_end_distance(xy: NDArray[np.float64], network: Network) -> NDArray[np.f
     return np.asarray(KDTree(ends).query(xy)[0])
 
 
-def one_a_place(ways: pd.DataFrame, *, weight: str, radius: float) -> pd.DataFrame:
-    """Keep the way with the largest weight of those within a radius of each other, and count them as ``ways``."""
+def one_a_place(ways: pd.DataFrame, *, weight: list[str], radius: float) -> pd.DataFrame:
+    """Keep the way with the largest weights of those within a radius of each other, and count them as ``ways``."""
     if ways.empty:
         return ways.assign(ways=np.zeros(0, np.int64))
     xy = ways[["x", "y"]].to_numpy()
@@ -268,5 +268,5 @@ def one_a_place(ways: pd.DataFrame, *, weight: str, radius: float) -> pd.DataFra
     links = coo_array((np.ones(len(near), bool), (near[:, 0], near[:, 1])), shape=(n, n))
     place = connected_components(links, directed=False)[1]
     table = ways.assign(place=place, ways=np.bincount(place)[place])
-    order = table.sort_values([weight, "x", "y"], ascending=[False, True, True], kind="stable")
+    order = table.sort_values([*weight, "x", "y"], ascending=[False] * len(weight) + [True, True], kind="stable")
     return order.drop_duplicates("place").sort_index().drop(columns="place").reset_index(drop=True)

@@ -91,7 +91,7 @@ class DiffOptions:
     shortest: Positive[float] = 30.0  # m of a piece that only one of the two has
     same_place: Positive[float] = 60.0  # m within which two missing connections are one
     driven: Probability = 0.5  # share of a base road that drives must be seen on, to judge its direction
-    min_expected: Positive[float] = 3.0  # drives expected on a turn that nobody made, or on a closed road
+    min_expected: Positive[float] = 1.0  # drives expected on a turn that nobody made, or on a closed road
     min_probability: Probability = 0.5  # of a difference, from which on it is listed
 
 
@@ -275,9 +275,9 @@ def _connections_added(ours: Roads, theirs: Roads, found: Mutual, options: DiffO
     closed = table["closed"] | table["closed_to"]
     table = table[~table["connected"] & ~closed & (table["count"] > 0)].reset_index(drop=True)
     table = with_crossings(table, theirs, rows=("other", "other_to"), radius=options.same_place)
-    table = one_a_place(table, weight="count", radius=options.same_place)
     table["dead_end_distance"] = dead_end_distance(table[["x", "y"]].to_numpy(), theirs.network)
     table["probability"] = probabilities("connection_added", table)
+    table = one_a_place(table, weight=["probability", "count"], radius=options.same_place)
     table = table[table["probability"] >= options.min_probability].reset_index(drop=True)
     own, base = ("edge", "at"), ("other", "other_at")
     return _connection_rows(table, "connection_added", ours, theirs, own=own, base=base)
@@ -289,9 +289,9 @@ def _connections_missing(ours: Roads, theirs: Roads, flows: pd.DataFrame, option
     table = with_other_map(*asked, theirs, ours, options.overlap)
     table = table[~table["connected"]].reset_index(drop=True)
     table = with_crossings(table, ours, rows=("other", "other_to"), radius=options.same_place)
-    table = one_a_place(table, weight="expected", radius=options.same_place)
     table["dead_end_distance"] = dead_end_distance(table[["x", "y"]].to_numpy(), ours.network)
     table["probability"] = probabilities("connection_missing", table)
+    table = one_a_place(table, weight=["probability", "expected"], radius=options.same_place)
     table = table[table["probability"] >= options.min_probability].reset_index(drop=True)
     change = np.where(is_level(table), "level_conflict", "connection_missing")
     own, base = ("other", "other_at"), ("edge", "at")

@@ -21,7 +21,7 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     "suspect_closed": ("log_expected",),
     "direction_changed": ("log_odds",),
     "connection_added": ("log_count", "dead_end"),
-    "connection_missing": ("log_expected", "crosses"),
+    "connection_missing": ("crosses",),
 }  # what each model weighs
 
 _COEFFICIENTS: Mapping[str, tuple[float, ...]] = {
@@ -29,8 +29,8 @@ _COEFFICIENTS: Mapping[str, tuple[float, ...]] = {
     "added": (0.74, 0.33, 0.1),
     "suspect_closed": (-2.61, 0.87),
     "direction_changed": (-1.75, 0.51),
-    "connection_added": (-1.0, 0.15, 3.57),
-    "connection_missing": (-0.08, -0.16, 3.12),
+    "connection_added": (-1.28, 0.21, 3.71),
+    "connection_missing": (-0.69, 3.46),
 }  # the constant, and one for each feature
 
 _NEAR = 60.0  # m within which the dead end of a road may be the reason why two roads are not joined
