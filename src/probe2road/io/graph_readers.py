@@ -31,6 +31,7 @@ from probe2road.io.atomic import settled
 from probe2road.io.graph_tables import OWN_COLUMNS, graph_from_edge_table, projected, require_finite
 from probe2road.io.graph_writers import GRAPH_MARK, parquet_siblings
 from probe2road.io.guard import parsing
+from probe2road.io.overture import holds_segments, segment_lines
 
 __all__ = ["graph_from_table", "read_note", "read_parquet_graph", "read_vector_graph"]
 
@@ -173,6 +174,9 @@ def graph_from_table(
     if not own and not len(table):
         raise InputError("holds no features", where=where, fix="give a file with road centrelines")
     table = _with_crs(table, crs, where)
+    if not own and holds_segments(table):
+        with parsing(where, "the segments of Overture are damaged", fix="download them again"):
+            table = segment_lines(table)
     require_finite(table, where=where)
     left, bottom, right, top = table.total_bounds if len(table) and not table.geometry.isna().all() else [[]] * 4
     target = working_crs(

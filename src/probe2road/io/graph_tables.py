@@ -183,10 +183,10 @@ def graph_from_edge_table(
 def _require_ids(table: pd.DataFrame, *, where: object) -> None:
     """Refuse ids that 64 bits do not hold: they would be turned into others."""
     for name in ("edge", "u", "v"):
-        values = table[name]
+        values = table[name].dropna()
         if pd.api.types.is_numeric_dtype(values.dtype) and len(values):
-            largest = pd.Series([values.min(), values.max()]).astype("float64").abs().max()
-            if not largest < 2.0**63:
+            largest = max(abs(float(values.min())), abs(float(values.max())))
+            if largest >= 2.0**63:
                 fault = f"column {name!r} holds ids beyond 2**63"
                 raise InputError(fault, where=where, fix="number the edges and nodes anew")
 
