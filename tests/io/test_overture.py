@@ -35,9 +35,10 @@ def segment(name: str, places: list[tuple[float, float]], *at: float, **more: An
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     closed = [{"access_type": "denied", "when": {"heading": "forward", "mode": None, "during": None}}]
+    in_part = [{"access_type": "denied", "when": {"heading": "backward"}, "between": [0.0, 0.5]}]
     bridge = [{"value": 1, "between": None}]
     rows = [
-        segment("east", EAST, 0.3334),
+        segment("east", EAST, 0.3334, access_restrictions=in_part),
         segment("north", NORTH, 0.5, access_restrictions=closed),
         segment("bridge", BRIDGE, level_rules=bridge),
         segment("rails", [(9.0, 48.02), (9.03, 48.02)], subtype="rail"),

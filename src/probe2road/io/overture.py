@@ -90,13 +90,13 @@ def _listed(values: Any) -> Iterable[dict[str, Any]]:
 
 
 def _oneway(restrictions: Any) -> str | None:
-    """Return the way in which vehicles may always drive, in the words of OpenStreetMap; None if in both."""
+    """Return the one way open to vehicles at all times and all along, as OpenStreetMap says it; None if both are."""
     denied = set()
     for rule in _listed(restrictions):
         when = rule.get("when") or {}
         modes = when.get("mode")
         for_cars = modes is None or bool(_VEHICLES & set(modes))
-        always = when.get("during") is None
+        always = when.get("during") is None and rule.get("between") is None
         if rule.get("access_type") == "denied" and for_cars and always and when.get("heading"):
             denied.add(when["heading"])
     return {frozenset({"backward"}): "yes", frozenset({"forward"}): "-1"}.get(frozenset(denied))
