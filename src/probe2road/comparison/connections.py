@@ -20,11 +20,20 @@ from scipy.spatial import KDTree
 
 from probe2road.comparison.mutual import Mutual
 from probe2road.comparison.overlap import OverlapOptions, Roads
+from probe2road.graph.levels import CLEARANCE, heights_at
 from probe2road.metrics.junctions import crossings_without_node, routes_within
 from probe2road.metrics.network import Network, locate
 from probe2road.metrics.projection import direction_over, project_along
 
-__all__ = ["base_connections", "driven_connections", "one_a_place", "with_crossings", "with_other_map"]
+__all__ = [
+    "base_connections",
+    "dead_end_distance",
+    "driven_connections",
+    "is_level",
+    "one_a_place",
+    "with_crossings",
+    "with_other_map",
+]
 
 _REACH = 35.0  # m from a connection to the spots from which it is looked at, at most half of the edge
 _ASIDE = 20.0  # m, the same for a change of roads in the middle of an edge
@@ -32,7 +41,6 @@ _DETOUR, _SLACK = 1.5, 20.0  # a way connects two spots up to this factor times 
 _FORK = 250.0  # m more where two roads part at a small angle
 _SMALL_ANGLE = 0.8  # cosine of the angle up to which it is small
 _SAME_NODE = 4.0  # m; crossings this close to a common node are none
-_CLEARANCE = 2.5  # m between two roads, from which on one passes over the other
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,11 +238,7 @@ def with_crossings(ways: pd.DataFrame, roads: Roads, *, rows: tuple[str, str], r
     if not len(i) or table.empty:
         return table
     lines, points = roads.graph.edges.geometry.to_numpy(), shapely.points(xy)
-    heights = [
-        shapely.get_z(shapely.line_interpolate_point(lines[row], shapely.line_locate_point(lines[row], points)))
-        for row in (i, j)
-    ]
-    clearance = np.abs(heights[0] - heights[1])
+    clearance = np.abs(heights_at(lines[i], points) - heights_at(lines[j], points))
     near = KDTree(xy).query_ball_point(table[["x", "y"]].to_numpy(), radius)
     for row, found in enumerate(near):
         pair = {int(table[rows[0]].iloc[row]), int(table[rows[1]].iloc[row])}
@@ -247,7 +251,7 @@ def with_crossings(ways: pd.DataFrame, roads: Roads, *, rows: tuple[str, str], r
 
 def is_level(ways: pd.DataFrame) -> NDArray[np.bool_]:
     """Tell of which ways the two roads pass over each other."""
-    return (ways["clearance"] >= _CLEARANCE).to_numpy(bool)
+    return (ways["clearance"] >= CLEARANCE).to_numpy(bool)
 
 
 def dead_end_distance(xy: NDArray[np.float64], network: Network) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ joined differently (`connections`). What follows from the evidence is said with 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import geopandas as gpd
 import numpy as np
@@ -150,7 +150,7 @@ def diff(graph: RoadGraph, base: RoadGraph, *, options: DiffOptions | None = Non
     options = options or DiffOptions()
     base = base.to_crs(graph.crs)
     require_common_area(graph, base, where="diff", name="base")
-    ours, theirs = (roads_of(_directed(one)) for one in (graph, base))
+    ours, theirs = (roads_of(replace(one, edges=in_driving_direction(one.edges))) for one in (graph, base))
     require_counts(ours, where="diff")
     found, back = mutual(ours, theirs, options.overlap)
     flows = base_flows(ours, theirs, found, back)
@@ -168,12 +168,6 @@ def diff(graph: RoadGraph, base: RoadGraph, *, options: DiffOptions | None = Non
     counts = table["change"].value_counts()
     logger.info("differences: %s", ", ".join(f"{counts.get(name, 0)} {name}" for name in DIFFERENCES))
     return table
-
-
-def _directed(graph: RoadGraph) -> RoadGraph:
-    """Return a graph whose one-way edges run in their driving direction."""
-    edges = in_driving_direction(graph.edges)
-    return graph if edges is graph.edges else RoadGraph(graph.nodes, edges, graph.turns)
 
 
 def _positions(on_base: pd.DataFrame, ours: Roads, theirs: Roads, flows: pd.DataFrame) -> pd.DataFrame:
@@ -274,11 +268,7 @@ def _connections_added(ours: Roads, theirs: Roads, found: Mutual, options: DiffO
     # Against the direction of a road went nobody, but a drive that was on the road beside it.
     closed = table["closed"] | table["closed_to"]
     table = table[~table["connected"] & ~closed & (table["count"] > 0)].reset_index(drop=True)
-    table = with_crossings(table, theirs, rows=("other", "other_to"), radius=options.same_place)
-    table["dead_end_distance"] = dead_end_distance(table[["x", "y"]].to_numpy(), theirs.network)
-    table["probability"] = probabilities("connection_added", table)
-    table = one_a_place(table, weight=["probability", "count"], radius=options.same_place)
-    table = table[table["probability"] >= options.min_probability].reset_index(drop=True)
+    table = _probable(table, "connection_added", theirs, "count", options)
     own, base = ("edge", "at"), ("other", "other_at")
     return _connection_rows(table, "connection_added", ours, theirs, own=own, base=base)
 
@@ -287,15 +277,21 @@ def _connections_missing(ours: Roads, theirs: Roads, flows: pd.DataFrame, option
     """Return the turns of the base that drives would have made, and for which our graph has no way."""
     asked = base_connections(theirs, flows, min_expected=options.min_expected)
     table = with_other_map(*asked, theirs, ours, options.overlap)
-    table = table[~table["connected"]].reset_index(drop=True)
-    table = with_crossings(table, ours, rows=("other", "other_to"), radius=options.same_place)
-    table["dead_end_distance"] = dead_end_distance(table[["x", "y"]].to_numpy(), ours.network)
-    table["probability"] = probabilities("connection_missing", table)
-    table = one_a_place(table, weight=["probability", "expected"], radius=options.same_place)
-    table = table[table["probability"] >= options.min_probability].reset_index(drop=True)
+    table = _probable(
+        table[~table["connected"]].reset_index(drop=True), "connection_missing", ours, "expected", options
+    )
     change = np.where(is_level(table), "level_conflict", "connection_missing")
     own, base = ("other", "other_at"), ("edge", "at")
     return _connection_rows(table, change, ours, theirs, own=own, base=base)
+
+
+def _probable(ways: pd.DataFrame, change: str, lacking: Roads, drives: str, options: DiffOptions) -> pd.DataFrame:
+    """Return the ways that a map probably lacks, one for each place, the most probable or else the most driven."""
+    table = with_crossings(ways, lacking, rows=("other", "other_to"), radius=options.same_place)
+    table["dead_end_distance"] = dead_end_distance(table[["x", "y"]].to_numpy(), lacking.network)
+    table["probability"] = probabilities(change, table)
+    table = one_a_place(table, weight=["probability", drives], radius=options.same_place)
+    return table[table["probability"] >= options.min_probability].reset_index(drop=True)
 
 
 def _connection_rows(

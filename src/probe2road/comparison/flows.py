@@ -53,13 +53,11 @@ def base_flows(ours: Roads, theirs: Roads, found: Mutual, back: Mutual) -> pd.Da
     n = len(theirs.sense)
     total: dict[str, NDArray[np.float64]] = {name: np.zeros(n) for name in ("along", "against", "support")}
     metres: dict[str, NDArray[np.float64]] = {name: np.zeros(n) for name in ("along", "against", "any")}
-    nearest = set(zip(back.best[0].tolist(), back.found[0].edge.tolist(), strict=True))  # pairs of our edge and theirs
+    nearest = pd.MultiIndex.from_arrays([back.best[0], back.found[0].edge]).unique()  # our edge, and theirs
     for way, count in ((0, counts[0]), (1, counts[1])):
         places, has = found.found[way], found.has[way]
         driven = has & (count[places.edge] > 0)
-        own = np.fromiter(
-            (pair in nearest for pair in zip(places.edge.tolist(), places.other.tolist(), strict=True)), bool
-        )
+        own = pd.MultiIndex.from_arrays([places.edge, places.other]).isin(nearest)
         driven &= own | (theirs.sense[np.maximum(places.other, 0)] == 0)
         for name, goes in (("along", places.along != (way == 1)), ("against", places.along == (way == 1))):
             rows = np.flatnonzero(driven & goes)

@@ -19,7 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from shapely.ops import substring
 
-from probe2road.comparison.overlap import Counterparts, OverlapOptions, Roads, counterparts
+from probe2road.comparison.overlap import Counterparts, OverlapOptions, Roads, counterparts, seen_from
 from probe2road.graph.roadgraph import graph_from_lines
 from probe2road.metrics.network import Network, locate, network_from_graph
 from probe2road.metrics.projection import direction_over, project_along
@@ -172,18 +172,17 @@ def _looked_up_again(
     stretch, at = project_along(
         xy, direction, rest.network, radius=options.radius, max_angle=options.max_angle, span=options.span
     )
-    on = stretch >= 0
-    there, _ = locate(rest.network, stretch[on], at[on])
+    on = np.flatnonzero(stretch >= 0)
+    away, runs_along = seen_from(xy[on], direction[on], rest.network, stretch[on], at[on], options.span)
     same = pd.MultiIndex.from_arrays([edge[on], rest.edge[stretch[on]]]).isin(known)
-    on[on] = same | (np.hypot(*(there - xy[on]).T) <= _AGAIN)
+    kept = same | (away <= _AGAIN)
+    on, away, runs_along = on[kept], away[kept], runs_along[kept]
     n = len(places.edge)
     other, other_offset = np.full(n, -1, np.int64), np.zeros(n)
     distance, along = np.full(n, np.nan), np.zeros(n, bool)
-    there, _ = locate(rest.network, stretch[on], at[on])
     other[rows[on]] = rest.edge[stretch[on]]
     other_offset[rows[on]] = rest.begin[stretch[on]] + at[on]
-    distance[rows[on]] = np.hypot(*(there - xy[on]).T)
-    along[rows[on]] = (direction_over(rest.network, stretch[on], at[on], options.span) * direction[on]).sum(axis=1) > 0
+    distance[rows[on]], along[rows[on]] = away, runs_along
     return replace(places, other=other, other_offset=other_offset, distance=distance, along=along)
 
 

@@ -23,7 +23,16 @@ from probe2road.metrics.network import Network, locate, network_from_graph
 from probe2road.metrics.projection import direction_over, project_along
 from probe2road.options import checked
 
-__all__ = ["Counterparts", "OverlapOptions", "Roads", "counterparts", "overlaps", "require_common_area", "roads_of"]
+__all__ = [
+    "Counterparts",
+    "OverlapOptions",
+    "Roads",
+    "counterparts",
+    "overlaps",
+    "require_common_area",
+    "roads_of",
+    "seen_from",
+]
 
 _BEYOND = 1000.0  # m between two maps, from which on they are of different places
 
@@ -101,10 +110,21 @@ def counterparts(roads: Roads, other: Roads, options: OverlapOptions, *, way: in
         found[both], place[both] = project_along(xy[both], direction[both], other.network, **near)
     on = found >= 0
     distance, along = np.full(len(edge), np.nan), np.zeros(len(edge), bool)
-    there, _ = locate(other.network, found[on], place[on])
-    distance[on] = np.hypot(*(there - xy[on]).T)
-    along[on] = (direction_over(other.network, found[on], place[on], options.span) * direction[on]).sum(axis=1) > 0
+    distance[on], along[on] = seen_from(xy[on], direction[on], other.network, found[on], place[on], options.span)
     return Counterparts(edge, offset, metres, found, place, distance, along)
+
+
+def seen_from(
+    xy: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    network: Network,
+    edge: NDArray[np.int64],
+    offset: NDArray[np.float64],
+    span: float,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return how far places on a network are from points, m, and whether they run along the direction there; (n,)."""
+    there, _ = locate(network, edge, offset)
+    return np.hypot(*(there - xy).T), (direction_over(network, edge, offset, span) * direction).sum(axis=1) > 0
 
 
 def overlaps(found: Counterparts) -> pd.DataFrame:

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from probe2road.graph.roadgraph import RoadGraph
 
-__all__ = ["crossing_layers"]
+__all__ = ["CLEARANCE", "crossing_layers", "heights_at"]
 
-_CLEARANCE = 2.5  # m between the heights of two roads, from which on one passes over the other
+CLEARANCE = 2.5  # m between the heights of two roads, from which on one passes over the other
 _ROUNDS = 10  # layers are as many at most; roads that pass over each other in turns would never come to an end
 
 
@@ -58,13 +58,20 @@ def _passings(lines: NDArray[np.object_]) -> tuple[NDArray[np.int64], NDArray[np
     )
     places = shapely.points(points)
     first, second = first[pair], second[pair]
-    above = _heights(lines[first], places) - _heights(lines[second], places)
-    decided = np.abs(above) >= _CLEARANCE
+    above = heights_at(lines[first], places) - heights_at(lines[second], places)
+    decided = np.abs(above) >= CLEARANCE
     first, second, above = first[decided], second[decided], above[decided]
     return np.where(above > 0, second, first), np.where(above > 0, first, second)
 
 
-def _heights(lines: NDArray[np.object_], places: NDArray[np.object_]) -> NDArray[np.float64]:
-    """Return the height of each line at a place on it, shape (n,)."""
+def heights_at(lines: NDArray[np.object_], places: NDArray[np.object_]) -> NDArray[np.float64]:
+    """Return the height of each line at a place on it, metres, shape (n,); NaN where it has none.
+
+    Examples
+    --------
+    >>> ramp = np.array([shapely.LineString([(0, 0, 2), (100, 0, 8)])])
+    >>> heights_at(ramp, shapely.points([[50.0, 0.0]])).tolist()
+    [5.0]
+    """
     on_line = shapely.line_interpolate_point(lines, shapely.line_locate_point(lines, places))
     return shapely.get_z(on_line)

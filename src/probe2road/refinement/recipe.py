@@ -82,16 +82,25 @@ class RefineOptions:
         )
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Stand:
-    """The input of a step: the current graph, and the fleet's matches to it."""
+    """The input of a step: the current graph, and the fleet's matches to it, which are made when they are asked for."""
 
     graph: RoadGraph
     fleet: Fleet
-    matches: Matches
     options: RefineOptions
     clean: CleanOptions | None
     drawn: RoadGraph  # what the refinement was given
+    proposed: bool  # as of `_Step`
+    found: Matches | None  # matches that the step before left valid
+
+    @property
+    def matches(self) -> Matches:
+        """Return the fleet's matches; the cost of links that are only proposed is higher."""
+        if self.found is None:
+            weights = gap_weights(self.graph, gap=self.options.gap_weight) if self.proposed else None
+            self.found = match(self.graph, self.fleet, options=self.options.matching, edge_weights=weights)
+        return self.found
 
 
 @dataclass(frozen=True)
@@ -260,9 +269,10 @@ def refine(
     for number, step in enumerate(_STEPS, start=1):
         if step.follows and not changed:
             continue
-        if matches is None or weighted != step.proposed:
-            matches, weighted = _matched(graph, fleet, options, proposed=step.proposed), step.proposed
-        result = step.apply(_Stand(graph, fleet, matches, options, clean, drawn))
+        valid = matches if weighted == step.proposed else None
+        stand = _Stand(graph, fleet, options, clean, drawn, step.proposed, valid)
+        result = step.apply(stand)
+        matches, weighted = stand.found, step.proposed
         changed = result is not graph
         if changed and not step.keeps_roads:
             logger.info("%s: %d nodes and %d edges", step.name, len(result.nodes), len(result.edges))
@@ -272,9 +282,3 @@ def refine(
             keep(step.stage, graph)
         report("refinement", number, len(_STEPS))
     return replace(graph, edges=in_driving_direction(graph.edges))  # last, because matches follow the lines
-
-
-def _matched(graph: RoadGraph, fleet: Fleet, options: RefineOptions, *, proposed: bool) -> Matches:
-    """Match the fleet; the cost of links that are only proposed is higher."""
-    weights = gap_weights(graph, gap=options.gap_weight) if proposed else None
-    return match(graph, fleet, options=options.matching, edge_weights=weights)

@@ -148,8 +148,8 @@ def add_driven_roads(graph: RoadGraph, fleet: Fleet, *, options: DrivenOptions |
     if (edge >= 0).all():
         return graph
     points = replace(points, edge=edge)
-    first, last = _runs(points, options.min_length)
-    new = _are_new(graph, points, first, last, options)
+    first, last, size = _runs(points, options.min_length)
+    new = _are_new(graph, points, first, last, size, options)
     bundles = _bundles(points, first[new], last[new], options)
     return _with_roads(graph, points, bundles, options) if bundles.course else graph
 
@@ -167,8 +167,8 @@ def _laid_down(fleet: Fleet) -> _Points:
     return _Points(owner, xy, course / np.maximum(np.hypot(*course.T), 1e-9)[:, None], np.full(len(xy), -1))
 
 
-def _runs(points: _Points, min_length: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first and the last unexplained point of every run that explained points of its trace enclose."""
+def _runs(points: _Points, min_length: float) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Return the first and the last unexplained point, and the length (m), of every run that explained ones enclose."""
     off = points.edge < 0
     step = np.hypot(*np.diff(points.xy, axis=0).T)
     known = (points.trace[1:] == points.trace[:-1]) & (step <= _LONGEST_STEP)
@@ -181,17 +181,20 @@ def _runs(points: _Points, min_length: float) -> tuple[NDArray[np.int64], NDArra
     first, last = first[inner], last[inner]
     enclosed = (stretch[first - 1] == stretch[first]) & (stretch[last + 1] == stretch[last])
     path = np.append(0.0, np.cumsum(np.where(known, step, 0.0)))
-    kept = enclosed & (path[last] - path[first] >= min_length)
-    return first[kept], last[kept]
+    size = path[last] - path[first]
+    kept = enclosed & (size >= min_length)
+    return first[kept], last[kept], size[kept]
 
 
 def _are_new(
-    graph: RoadGraph, points: _Points, first: NDArray[np.int64], last: NDArray[np.int64], options: DrivenOptions
+    graph: RoadGraph,
+    points: _Points,
+    first: NDArray[np.int64],
+    last: NDArray[np.int64],
+    size: NDArray[np.float64],
+    options: DrivenOptions,
 ) -> NDArray[np.bool_]:
     """Tell which runs shorten the way over the graph, and are no lane beside an edge, shape ``(R,)``."""
-    step = np.hypot(*np.diff(points.xy, axis=0, prepend=points.xy[:1]).T)
-    path = np.cumsum(step)
-    size = path[last] - path[first]
     edge, along = _places(graph, points, np.stack([first - 1, last + 1], axis=1))
     new = _ways(graph, edge, along) > options.detour * size + options.slack
     long = np.flatnonzero(new & (size > options.max_beside))
